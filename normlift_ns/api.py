@@ -35,10 +35,9 @@ from normlift_ns.data.open_scene import (
 from normlift_ns.data.transforms import write_transforms
 from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, precomputed_features
 from normlift_ns.encoders.build import make_source, source_settings
-from normlift_ns.encoders.langsplat import check_unique_stems
+from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
 from normlift_ns.encoders.text_files import write_text_embeddings
 from normlift_ns.errors import InputError
-from normlift_ns.evidence_collection import FeatureExport
 from normlift_ns.io.atomic import atomic_file, commit_directory, draft_directory, numbered_paths, write_text_file
 from normlift_ns.io.memory import refuse_small_memory
 from normlift_ns.io.run_dir import (
@@ -103,11 +102,11 @@ def lift_run(
             vectors [R, D]. The label map has the size of the undistorted image, before or after `lift_downscale`. Its
             values are regions 0..R-1, or -1 for no region. Pass a list with one pair per training image, or a
             dictionary by image name, which may omit images.
-        texts: prompts for your own features, with their vectors [D]. The run stores them for later queries.
+        texts: vector [D] of each prompt, for your own features. The run stores the vectors for later queries.
         lift: options of the lift. If None, use the defaults.
         queries: prompts to store in the run; ns-render and ns-viewer show their relevancy.
-        data: as in `open_scene`; for a config only.
-        load_step: as in `open_scene`; for a config only.
+        data: as in `open_scene`; allowed only with a config.
+        load_step: as in `open_scene`; allowed only with a config.
         output_dir: output folder, instead of the outputs folder of the trained run.
         timestamp: name of the new run directory. If None, use the current time, with a number if such a run exists.
         overwrite: replace an existing run directory of that name, and exported files whose content differs.
@@ -198,7 +197,7 @@ class PreparedLift:
     texts: Mapping[str, Float[Tensor, " d"]] | None
     """The user's own text embeddings by prompt; None if the encoder embeds prompts."""
     encoder: Mapping[str, Any]
-    """Options with which queries encode prompts to match the features."""
+    """Options of the text encoder that matches the features."""
 
 
 def run_lift(request: LiftRequest) -> LiftedRun:
@@ -268,7 +267,7 @@ def announce(prepared: PreparedLift) -> None:
 
 
 def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str | None:
-    """Compare renders with training images; return a warning if they differ, or raise if the scene is another one."""
+    """Compare renders with training images; return a warning if they differ, or raise if they show different scenes."""
     settings = RasterSettings.recorded({**scene.identity, "gsplat_rules": resolve_gsplat_version(scene, options)})
     measured_with = RasterSettings.recorded(scene.identity)
     match = scene.alignment if isinstance(scene, SplatScene) and settings == measured_with else None
@@ -320,7 +319,7 @@ def query_to_store(
     """Return the query that a new run stores for these prompts; None without prompts.
 
     Raises:
-        ValueError: the vectors of the prompts and the features have different lengths.
+        ValueError: the vectors of the prompts and the features have different dimensions.
     """
     if len(queries) == 0:
         return None
@@ -419,7 +418,7 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> config_classes.Tra
         **{**vars(source.model_config), "semantics": Path(FIELD_FOLDER)}
     )
     if location.data_moved or config.output_dir.is_absolute():
-        set_dataset(config, location.data)  # relative paths would not lead to the dataset
+        set_dataset(config, location.data)  # relative paths would not resolve to the dataset
     skip_seed_points(config)
     # "gpu" means the pipeline's device; "cpu" would pin memory, which needs CUDA
     config.pipeline.datamanager.cache_images = "gpu"
@@ -429,8 +428,8 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> config_classes.Tra
 def splat_config(scene: SplatScene, run_dir: Path) -> config_classes.TrainerConfig:
     """Return a nerfstudio config for a run lifted from a PLY file or gsplat checkpoint, which has no config of its own.
 
-    With this config, nerfstudio loads the cameras in the run directory without transforming them. All paths except
-    that of the field are absolute, because there is no training directory for relative paths.
+    With this config, nerfstudio loads the cameras in the run directory without transforming them. All paths except that
+    of the field are absolute, because the run has no training directory as a base for relative paths.
     """
     cameras = run_dir / TRANSFORMS_FILE
     dataparser = config_classes.NerfstudioDataParserConfig(

@@ -35,7 +35,7 @@ class ArgumentError(InputError, TypeError):
 
 
 class PathError(InputError, OSError):
-    """InputError for a path that no file can have; also an OSError, as in Python's own functions."""
+    """InputError for a path that is not valid for any file; also an OSError, as in Python's own functions."""
 
 
 class MissingImageError(InputError, KeyError, IndexError):
@@ -45,15 +45,18 @@ class MissingImageError(InputError, KeyError, IndexError):
 
 
 class OutputError(Exception):
-    """Error for a failed write to standard output. It is not an OSError, which loaders report as a read error."""
+    """Error for a failed write to standard output.
+
+    It is not an OSError, because loaders report an OSError as a read error.
+    """
 
 
 def escape_unprintable(text: str, keep: str = "") -> str:
     r"""Escape unprintable characters, which could move the cursor, hide text or reverse it.
 
     Args:
-        text: Untrusted text, such as a prompt or a path.
-        keep: Unprintable characters to keep, for example a line break.
+        text: untrusted text, such as a prompt or a path.
+        keep: unprintable characters to keep, for example a line break.
 
     >>> print(escape_unprintable("red\x1b[31m mug\n"))
     red\x1b[31m mug\n

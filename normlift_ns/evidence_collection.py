@@ -25,9 +25,14 @@ from normlift_ns.core.evidence import MASKED, Evidence
 from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene, View
 from normlift_ns.data.images import filled_function, label_undistortion
-from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, RegionFeatures, iterate_view_features
+from normlift_ns.encoders.base import (
+    FeatureSource,
+    PrecomputedFeatures,
+    RegionFeatures,
+    StoredMaps,
+    iterate_view_features,
+)
 from normlift_ns.encoders.cache import CachedRegions, cached
-from normlift_ns.encoders.langsplat import LangSplat, write_langsplat
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_metadata
 from normlift_ns.options import BackendName, LiftOptions, RasterizeMode
@@ -36,6 +41,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.regions import LabelFiles
 
 if TYPE_CHECKING:
+    from normlift_ns.encoders.langsplat import FeatureExport
     from normlift_ns.progress import StageTimer
 
 _MAX_CHUNK = 16
@@ -60,7 +66,7 @@ class RasterConfig:
     weight_power: int
     """Exponent of the summed weights."""
     clip_planes: tuple[float, float] | None = None
-    """Near and far plane of the training in world units; None: those of splatfacto."""
+    """Near and far planes of the training, in world units; None for those of splatfacto."""
 
     @property
     def settings(self) -> RasterSettings:
@@ -77,14 +83,6 @@ class RasterConfig:
     def key(self) -> list[Any]:
         """Part of every cache key, as JSON types."""
         return [self.rasterize_mode, self.weight_power, str(self.dtype), asdict(self.settings), self.backend]
-
-
-class FeatureExport(NamedTuple):
-    """Export of 2D features to LangSplat files, in addition to the lift."""
-
-    folder: Path
-    overwrite: bool
-    """Replace existing files whose content differs."""
 
 
 class ViewObservations(NamedTuple):
@@ -137,7 +135,7 @@ class EvidenceCollection:
     cache: Path
     """Directory of cached features and evidence."""
     export: FeatureExport | None
-    """Destination of the 2D features; None: no export."""
+    """Destination of the 2D features; None for no export."""
 
     @cached_property
     def _cached_source(self) -> FeatureSource:
@@ -178,7 +176,7 @@ class EvidenceCollection:
 
             def done(view: View) -> None:
                 if self.export is not None:
-                    write_langsplat(source, view.image, view.name, *self.export)
+                    self.export.write(source, view.image, view.name)
                 step()
 
             divisor = self.options.lift_downscale
@@ -204,7 +202,7 @@ def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tenso
 
 
 class ViewBatch(NamedTuple):
-    """Batch of views, as input of the rasterizer and the lift."""
+    """Batch of views, as input to the rasterizer and the lift."""
 
     cameras: list[Camera]
     labels: list[Int32[Tensor, "h w"]]
@@ -216,10 +214,10 @@ class ViewBatch(NamedTuple):
 
 
 def chunk_views(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]:
-    """Split views into chunks of at most 16. Each chunk has one evidence file; an interrupted lift loses one at most.
+    """Split views into chunks of at most 16; an interrupted lift loses the results of at most one chunk.
 
-    Every process gets the same number of chunks. The evidence of a view does not depend on the other views in its
-    chunk.
+    Every process gets the same number of chunks, and each chunk has one evidence file. The evidence of a view does not
+    depend on the other views in its chunk.
 
     >>> [[len(chunk) for chunk in chunk_views(range(45), processes)] for processes in (1, 2)]
     [[15, 15, 15], [12, 12, 12, 9]]
@@ -414,14 +412,14 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     therefore show the distorted image, so the function accepts only maps of exactly the undistorted size.
 
     Args:
-        views: The same view at every size that the label map may have.
+        views: the same view at every size that the label map may have.
     Raises:
-        ValueError: The map has the wrong size. If the source resamples maps, the function warns instead.
+        ValueError: the map has the wrong size. If the source resamples maps, the function warns instead.
     """
     original_size, name = views[0].original, views[0].name
     maps = source.regions if isinstance(source, RegionFeatures) else source
     maps = maps.inner if isinstance(maps, CachedRegions) else maps
-    if original_size is None or not isinstance(maps, LabelFiles | LangSplat) or getattr(maps, "undistort", None):
+    if original_size is None or not isinstance(maps, StoredMaps) or getattr(maps, "undistort", None):
         return
     file, width, height = maps.size(name)
     sizes = [(view.camera.width, view.camera.height) for view in views]
@@ -432,9 +430,9 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
         if not maps.resample:
             raise InputError(
                 f"label map {file} of {name} {mismatch}. Make the label maps from the undistorted images, or give "
-                "--regions-resample True and accept an error of some pixels"
+                "--regions-resample True and accept an error of a few pixels"
             )
-        warnings.warn(f"label map {file} {mismatch}. The map is resized, and may be off by some pixels", stacklevel=2)
+        warnings.warn(f"label map {file} {mismatch}. The map is resized, and may be off by a few pixels", stacklevel=2)
     elif (width, height) == original_size:
         warnings.warn(
             f"{reason} without changing its size. Make sure that the label maps in {file.parent} were made from the "
@@ -461,12 +459,12 @@ def cache_views(evidence: Evidence, folder: Path, keys: Sequence[str]) -> None:
     """Write the evidence of views to a file in a folder.
 
     Args:
-        evidence: Evidence of the views.
-        folder: Folder of the cache.
-        keys: Digests of the inputs of each view, in the order of the views.
+        evidence: evidence of the views.
+        folder: folder of the cache.
+        keys: digest of the inputs of each view, in the order of the views.
 
     Raises:
-        OSError: The file cannot be written, for instance because the disk is full.
+        OSError: the file cannot be written, for instance because the disk is full.
     """
     path = _cache_path(folder, keys)
     evidence.save(path, key=path.stem, remarks={_VIEWS: " ".join(keys)}, own=True)
@@ -487,7 +485,7 @@ def find_cached_views(folder: Path, keys: Sequence[str]) -> dict[int, CachedView
 
 
 def views_in_cache(folder: Path, keys: Sequence[str]) -> list[bool]:
-    """Return a boolean for each view, which is True if the header of a file in the folder lists its key."""
+    """Return a boolean for each key; it is True if the header of a file in the folder lists the key."""
     listed = {key for keys in _cache_headers(folder).values() for key in keys}
     return [key in listed for key in keys]
 

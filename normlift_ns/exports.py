@@ -131,14 +131,14 @@ class TrainedSplat(NamedTuple):
 
 
 class SplatLabels(NamedTuple):
-    """Semantics of all Gaussians. A file contains those that its format supports."""
+    """Semantics of all Gaussians. A file contains the properties that its format supports."""
 
     field: SemanticField
     answer: Answer | None = None
     instances: Instances | None = None
     """Classes and objects of the answer (default: those of `answer_instances`)."""
     objects: Mapping[str, Any] | None = None
-    """Content of <stem>_objects.json. If None, there is no such file, and `overwrite` removes an earlier one."""
+    """Content of <stem>_objects.json. If None, no such file is written, and `overwrite` removes an earlier one."""
 
 
 class WrittenSplat(NamedTuple):
@@ -166,7 +166,8 @@ def write_splat(
 
     Args:
         path: path of the file.
-        splat: the Gaussians. The file records the mode "antialiased", because other tools assume "classic" by default.
+        splat: the Gaussians. The file records the rasterization mode only if it is "antialiased", because other tools
+            assume "classic" by default.
         keep: mask of the Gaussians to write. Those that `exportable_rows` leaves out are skipped.
         file_format: format of the file. If None, the ending of the file name selects it; see `_FORMATS`.
         overwrite: replace existing files.
@@ -213,7 +214,7 @@ def write_splat(
 
 def _named_format(path: Path) -> SplatFormat:
     if path.suffix.lower() in _UNWRITTEN:
-        raise InputError(f"{path} is not written: give a name that ends with .ply, {', '.join(_FORMATS)}")
+        raise InputError(f"{path} is not written: give a name with one of the endings .ply, {', '.join(_FORMATS)}")
     for end, kind in _FORMATS.items():
         if path.name.lower().endswith(end):
             return kind
@@ -382,7 +383,7 @@ def check_no_properties(cloud: PlyData, names: Iterable[str]) -> None:
 
 
 def vertex_positions(cloud: PlyData) -> Float64[np.ndarray, "p 3"]:
-    """Return x, y, z of the vertices of a cloud."""
+    """Return the positions of the vertices of a cloud."""
     return np.stack([np.asarray(cloud["vertex"][axis], np.float64) for axis in "xyz"], axis=1)
 
 
@@ -396,7 +397,7 @@ def label_cloud(
         means: centers [M, 3] of the Gaussians to take labels from, in the coordinates of the scene, float64.
         columns: labels of these Gaussians, by property name.
     Raises:
-        ValueError: there is no Gaussian, all Gaussians are at one position, or as in `write_cloud`.
+        ValueError: `means` is empty or all Gaussians are at one position; also as in `write_cloud`.
         FileExistsError, OSError: as in `write_cloud`.
     """
     if len(means) == 0:

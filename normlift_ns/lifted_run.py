@@ -12,14 +12,14 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
 from normlift_ns import exports
 from normlift_ns.analysis.explain import RecordedVotes, Why
-from normlift_ns.analysis.inventory import Inventory, as_instances, best_words, find_inventory, mean_directions
+from normlift_ns.analysis.inventory import Inventory, Vocabulary, list_inventory
 from normlift_ns.analysis.objects import (
     Catalogue,
     Floaters,
@@ -37,10 +37,8 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.scene import Scene
 from normlift_ns.data.open_scene import open_stored_run
-from normlift_ns.encoders.null_words import null_words
-from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.encoders.text_files import LazyTextEncoder, check_template
-from normlift_ns.errors import InputError, MissingImageError, truncate_text
+from normlift_ns.errors import InputError, MissingImageError
 from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
@@ -55,7 +53,6 @@ from normlift_ns.options import (
     RelevancyRule,
     check_number,
     check_path,
-    check_prompt_list,
     renamed,
 )
 from normlift_ns.query.engine import Answer, Finding, run_query
@@ -64,10 +61,6 @@ from normlift_ns.query.text_encoder import encoder_name, own_words, text_encoder
 from normlift_ns.rasterization.rasterize import render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering.figures import make_display, render_outputs, write_masks
-
-_MANY_WORDS, _FALSE_NAMES, _SAMPLE = 100, 0.25, 5000
-"""Settings of `inventory`: the minimum number of words for its test against chance, the expected number of wrong names
-that this test allows, and the approximate number of Gaussians in its sample of the scene."""
 
 
 @check_arguments
@@ -98,7 +91,7 @@ class LiftedRun:
 
     @property
     def features(self) -> Float[Tensor, "n d"]:
-        """Unit direction of every Gaussian after the vote, or 0 without a direction, computed at every access."""
+        """Unit direction of every Gaussian after the vote, 0 if it has none; computed on every access."""
         return self.field.directions()
 
     @property
@@ -141,14 +134,14 @@ class LiftedRun:
 
         Args:
             texts: prompts for the text encoder of the run.
-            vectors: vectors [D] of further prompts by name, in the space of the features. They have any length > 0, and
-                need no text encoder, unless the rule compares with negatives.
+            vectors: vectors [D] of further prompts by name, in the space of the features. They may have any norm > 0,
+                and need no text encoder unless the rule compares with negatives.
             negatives: negative prompts to compare with. If None, use those of the encoder.
             relevancy: formula that computes relevancy from cosines; see `normlift_ns.relevancy`. "auto" is contrast if
                 the lift compared the scene with unrelated words, else lerf with negatives, else cosine.
             threshold: relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
-                relevancies. None is 0.5, or 0.02 for the rule margin, or "auto" for the rule cosine with encoders other
-                than "color".
+                relevancies. None means 0.02 for the rule margin, "auto" for the rule cosine with encoders other than
+                "color", and otherwise 0.5.
             min_reliability: minimum reliability R of selected Gaussians, in 0..1.
             refined: use the directions after the vote.
         Raises:
@@ -198,19 +191,19 @@ class LiftedRun:
 
     @check_arguments
     def save(self, question: Query | Answer) -> Path:
-        """Store a query in the run in place of an earlier one, and return the path of its file.
+        """Store a query in the run in place of an earlier one, and return the path of the query file.
 
         ns-render and ns-viewer then show the relevancy of its prompts.
 
         Raises:
-            ValueError: the vectors of the query and the directions of the field have different lengths.
+            ValueError: the vectors of the query and the directions of the field have different dimensions.
         """
         question = question.question if isinstance(question, Answer) else question
         if question.embeddings.shape[1] != self.field.dimension:
             raise InputError(
                 f"the query has vectors of {question.embeddings.shape[1]} numbers, but the features of "
                 f"{self.folder} "
-                f"have {self.field.dimension}; query this run again, and save that answer"
+                f"have {self.field.dimension}; query this run again, and save the new answer"
             )
         return save_query(self.folder / FIELD_FOLDER, question)
 
@@ -246,8 +239,8 @@ class LiftedRun:
             The row indices of the written Gaussians, in the order of the file.
         Raises:
             FileExistsError: a file exists and `overwrite` is False.
-            ValueError: all Gaussians of `part` are invisible, or the mask has the wrong type or length. Or the name is
-                reserved for files of a run, or the options of objects are given without an answer.
+            ValueError: all Gaussians of `part` are invisible, or the mask has the wrong type or length. Also if the
+                name is reserved for files of a run, or the options of objects are given without an answer.
         """
         path = check_path("path", path)
         if path.name in ("", ".."):
@@ -314,7 +307,7 @@ class LiftedRun:
         coordinates: Literal["capture", "scene"] = "capture",
         overwrite: bool = False,
     ) -> exports.LabelTransfer:
-        """Label a point cloud or mesh with the nearest Gaussians, and write it to a new PLY file.
+        """Label a point cloud or mesh with the semantics of the nearest Gaussians, and write it to a new PLY file.
 
         Each point gets the relevancies, class_id and instance_id of its nearest Gaussian.
 
@@ -330,8 +323,8 @@ class LiftedRun:
         Raises:
             FileNotFoundError: the cloud does not exist.
             FileExistsError: a file exists and `overwrite` is False.
-            ValueError: `part` has no answer, the cloud is not a PLY file or already has such labels, or the distance is
-                not positive.
+            ValueError: `part` has no answer, the cloud is not a PLY file or already has properties of these names, or
+                the distance is not positive.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -371,7 +364,7 @@ class LiftedRun:
             part: answer or finding that selects the Gaussians, or a mask of Gaussians. A mask is explained with the
                 refined directions.
         Raises:
-            ValueError: the selection is empty, or the mask has the wrong type or length. Or the run stores only
+            ValueError: the selection is empty, or the mask has the wrong type or length. Also if the run stores only
                 directions, and its cache no longer has the evidence or the features.
             FileNotFoundError: the run stores only directions, and an image is missing.
 
@@ -432,7 +425,8 @@ class LiftedRun:
 
         Args:
             vocabulary: candidate names of objects. If None, use the words of the encoder: the 1,000 classes of
-                imagenet, the names of colors, or the texts of your own features. Other encoders have no words.
+                imagenet, the names of colors, or the texts of your own features. With other encoders, objects are only
+                numbered.
             meters_per_unit: as in `catalogue`.
         Raises:
             ValueError: the encoder cannot encode a word, or as in `why` and `catalogue`.
@@ -445,49 +439,10 @@ class LiftedRun:
         """
         if meters_per_unit is not None:
             check_number("meters_per_unit", meters_per_unit)
-        words = own_words(self.field) if vocabulary is None else tuple(dict.fromkeys(vocabulary))
-        check_prompt_list("vocabulary", words)
-        kind = find_encoder_kind(encoder_name(self.field))
-        unknown = [word for word in words if kind is not None and not kind.known_words(word)]
-        if len(unknown) > 0:
-            raise InputError(
-                f"the encoder of the run cannot encode {len(unknown)} of the {len(words)} words of the vocabulary; "
-                f"remove them: {truncate_text(', '.join(unknown), 400)}"
-            )
-        (evidence, features), norm = self.votes.table, self.field.scalars.norm
-        spread = 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
-        means = self.scene.gaussians.means
-        instance_id = find_inventory(evidence, features, means, spread)
-        directions = mean_directions(evidence, features, instance_id)
-        names = self._names(instance_id, directions, words)
-        instances = as_instances(instance_id, names)
-        catalog = make_catalogue(
-            self.scene, self.field, instances, self.to_capture, meters_per_unit=meters_per_unit, device=self.device
-        )
-        return Inventory(instance_id, catalog)
-
-    def _names(
-        self, instance_id: Int32[Tensor, " n"], directions: Float64[Tensor, "m d"], words: tuple[str, ...]
-    ) -> tuple[str, ...]:
-        """Return a name for every object of an inventory."""
-        names = [f"object {number}" for number in range(1, len(directions) + 1)]
-        if len(words) == 0 or len(names) == 0:
-            return tuple(names)
-        kind = find_encoder_kind(encoder_name(self.field))
-        others = null_words() if kind is not None and kind.has_null_words and len(words) < _MANY_WORDS else ()
-        compared = tuple(dict.fromkeys((*words, *others)))
-        absolute = len(compared) < _MANY_WORDS or (kind is not None and kind.present_from is not None)
-        sample = self.field.directions(torch.arange(0, len(self.field), max(1, len(self.field) // _SAMPLE)))
-        vectors, limit = torch.from_numpy(self.texts.rows(compared)), float("inf") if absolute else _FALSE_NAMES
-        best = best_words(directions, sample, vectors, by_chance=limit, count=len(words))
-        chosen = {number: words[index] for number, index in enumerate(best, 1) if index is not None}
-        if len(chosen) > 0:
-            answer = self.ask(*dict.fromkeys(chosen.values()))
-            for number, word in chosen.items():
-                selected = answer[word].mask[instance_id == number]
-                if answer[word].verdict == "found" and float(selected.float().mean()) > 0.5:
-                    names[number - 1] = word
-        return tuple(names)
+        words = own_words(self.field) if vocabulary is None else vocabulary
+        encode = lambda texts: self.texts.rows(texts)  # noqa: E731, PLW0108 (loads the encoder only if needed)
+        known = Vocabulary.of(words, encoder_name(self.field), encode, lambda texts: self.ask(*texts))
+        return list_inventory(self.votes, known, self.to_capture, meters_per_unit=meters_per_unit, device=self.device)
 
     @property
     def to_capture(self) -> SimilarityTransform:
@@ -509,7 +464,7 @@ class LiftedRun:
 
     @check_arguments
     def floaters(self, limit: float = FLOATER_THRESHOLD) -> Floaters:
-        """Find Gaussians that likely belong to no surface; see `analysis.objects`.
+        """Find Gaussians that are probably not part of a surface; see `analysis.objects`.
 
         `run.export(path, ~floaters.mask)` writes the scene without them.
 
@@ -550,8 +505,8 @@ class LiftedRun:
         Args:
             view: index or name of the image. The folder and the suffix may be omitted.
         Raises:
-            ValueError: several images have this name, or no image does. The latter is also a KeyError and an
-                IndexError.
+            ValueError: several images have this name, or no image has it. The error for no image is also a KeyError and
+                an IndexError.
         """
         cameras, names = self.scene.train.cameras, self.scene.train.names
         if not isinstance(view, str | Path):
@@ -637,8 +592,8 @@ def open_run(
         text_embeddings: NPZ file with a vector for each prompt, which replaces the text encoder of the lift.
         prompt_template: template for prompts, such as "a photo of {}". If None, use the template of the lift.
     Raises:
-        FileNotFoundError, ValueError: as in `open_scene`; also if the run has no semantics, or those of other
-            Gaussians.
+        FileNotFoundError, ValueError: as in `open_scene`; also if the run has no semantics, or the semantics belong to
+            other Gaussians.
 
     >>> run = open_run(config)
     >>> answer = run.ask("red", "yellow", min_reliability=0.3)

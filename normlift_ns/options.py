@@ -28,7 +28,7 @@ from normlift_ns.errors import InputError, PathError
 from normlift_ns.registry import installed_names
 
 _MAX_INT, _MAX_FLOAT = 2**31 - 1, 1e30
-"""Default upper bounds of integer and float options, which avoid overflow in int32 and float32."""
+"""Default upper bounds of integer and float options. They prevent overflow in int32 and float32."""
 _MIN_DIVISOR = 1e-6
 """Lower bound of options that are used as divisors."""
 MAX_PROMPT_LENGTH = 10_000
@@ -416,7 +416,7 @@ RasterizeMode = Literal["classic", "antialiased"]
 BackendName = Literal["auto", "triton", "gsplat", "numba", "torch"]
 """Rasterization backend; see `normlift_ns.rasterize_evidence`."""
 Primitive = Literal["3dgs", "2dgs"]
-"""Kind of the trained Gaussians: 3D ones, or the flat ones of 2D Gaussian Splatting."""
+"""Kind of the trained Gaussians: 3D Gaussians, or the flat Gaussians of 2D Gaussian Splatting."""
 GSPLAT_VERSIONS = ("1.4", "1.5", "1.6")
 """gsplat versions with different rasterization rules."""
 GsplatVersion = Literal["auto", "1.4", "1.5", "1.6", "installed"]
@@ -448,7 +448,8 @@ BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things"
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
 VoteKind = Literal["paper", "posterior"]
 ReliabilityKind = Literal["paper", "pairs", "angular"]
-"""Weighting of a Gaussian's own evidence against that of its neighbors in a vote; see `normlift_ns.refine`."""
+"""Kind of reliability to store; see `LiftOptions`. The kind of vote, `VoteKind`, is explained in
+`normlift_ns.refine`."""
 WithoutDirection = Literal["none", "first"]
 """Class that an evaluation assigns to Gaussians without a direction: no class, or the first class."""
 OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS = 4.0, 20
@@ -520,7 +521,7 @@ class SourceOptions:
     regions_dir: Path | None = None
     """Folder with one label map per image: a PNG or NPY file with the same stem as the image."""
     regions_background: int = 0
-    """Value of label map pixels that belong to no region. Negative values never belong to a region."""
+    """Value of label map pixels that do not belong to a region. Negative values never belong to a region."""
     regions_resample: bool = False
     """Resize label maps to the image size with nearest-neighbor sampling. False: stop with an error if the sizes
     differ."""
@@ -580,18 +581,18 @@ class SplatOptions:
     """Folder with one mask per image. The lift ignores pixels with a mask value of zero."""
     world_transform: Path | Literal["auto"] | None = "auto"
     """Transform from the world of the cameras to that of the splat. auto: none, unless the splat fits its images only
-    in one of the worlds that tools produce; that world is then used. A path: a file with a similarity transform as a
-    4 x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY file. None: no transform, without a
-    search."""
+    after a rotation, normalization or scaling that common tools apply; this transform is then used. A path: a file with
+    a similarity transform as a 4 x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY file.
+    None: no transform, without a search."""
     gsplat_normalize: bool = True
     """Assume that gsplat's trainer normalized the world, which is its default, and recompute the transform from the
-    COLMAP project. For a PLY file, it is one of the worlds that --world-transform auto tries."""
+    COLMAP project. For a PLY file, --world-transform auto tries this transform among others."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None
-    """Interval n of held-out images: training left out every n-th image, starting with the first. gsplat's trainer uses
-    8, and so does Inria's with --eval. None: as in the cfg.yml of gsplat's trainer or the cfg_args of Inria's, or else
-    the held-out images in transforms.json."""
+    """Interval n of held-out images: training left out every n-th image, starting with the first. gsplat's trainer and
+    Inria's trainer with --eval use 8. None: as in the cfg.yml of gsplat's trainer or the cfg_args of Inria's trainer,
+    or else the held-out images in transforms.json."""
     eval_images: tuple[str, ...] = ()
     """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction such as
     0.1, which is the default of ns-train."""
@@ -599,9 +600,9 @@ class SplatOptions:
     """Rasterization mode that the splat was trained with. Default: as recorded in the file or in the cfg.yml of
     gsplat's trainer, else classic."""
     primitive: Primitive | None = None
-    """Kind of the Gaussians. 2dgs: flat ones of 2D Gaussian Splatting, whose third scale is not used. Default: 2dgs if
-    gsplat's trainer recorded 2D Gaussians, the PLY file has two scales, or the file name contains 2dgs; otherwise
-    3dgs."""
+    """Kind of the Gaussians. 2dgs: the flat Gaussians of 2D Gaussian Splatting, whose third scale is not used. Default:
+    2dgs if gsplat's trainer recorded 2D Gaussians, the PLY file has two scales, or the file name contains 2dgs;
+    otherwise 3dgs."""
     background: Background | None = None
     """Background color behind the splat, and behind images with an alpha channel. Default: as in the cfg_args of
     Inria's trainer, else black."""
@@ -649,18 +650,18 @@ class RefineConfig(CheckedOptions):
     --vote-prior views for all neighbors together. paper: one vote, as for each neighbor (equations 9 and 10 of the
     paper)."""
     k: int = 36
-    """Number of neighbors K in the vote, at least 1. Larger values use a wider neighborhood and take longer. More than
-    256 count as 256."""
+    """Number of neighbors K in the vote, at least 1. Larger values use a wider neighborhood and take longer. Values
+    above 256 count as 256."""
     sigma_d: float | None = None
     """Width of the spatial decay of votes, > 0. Larger values give distant neighbors more weight. The unit is the
     median distance from a Gaussian to the nearest one at another position. None: 2 for posterior, 1 for paper."""
     tau: float | None = None
     """Cosine at which the agreement of two directions is one half, in -1..1. Larger values require more similar
-    directions. None: for posterior, measured on neighbors that share their regions after a consensus, otherwise 0.9;
-    0.95 for paper."""
+    directions. None: for posterior, a value measured on neighbors that share regions if a consensus changed features,
+    otherwise 0.9; for paper, 0.95."""
     gamma: float | None = None
     """Softness of the agreement around the cosine --vote-tau, > 0. Larger values blur the distinction between similar
-    and different directions. None: for posterior, (1 - tau) / 2 with a measured tau, otherwise 0.05; 0.4 for paper."""
+    and different directions. None: for posterior, (1 - tau) / 2 with a measured tau, otherwise 0.05; for paper, 0.4."""
     delta: float | None = None
     """Margin Delta by which the best neighbor must win the vote, >= 0. Larger values change fewer Gaussians.
     None: 0."""
@@ -707,8 +708,9 @@ class LiftOptions(CheckedOptions):
     """Strength of the prior in the reliability, in virtual views, >= 0. Larger values lower the reliability of
     Gaussians with few views."""
     reliability: ReliabilityKind = "paper"
-    """Reliability R to store. paper: equation 8 of the paper. pairs: agreement of pairs of views, so that a Gaussian of
-    one view is not reliable. angular: the same, but views from nearby count less. The vote always uses the paper's."""
+    """Reliability R to store. paper: equation 8 of the paper. pairs: agreement of pairs of views, so that a Gaussian
+    with only one view is not reliable. angular: as pairs, but views from nearby cameras count less. The vote always
+    uses paper."""
     unlabeled: UnlabeledMode = "ignore"
     """Treatment of pixels without a region. ignore: leave them out. dilute: count them as observations of the zero
     vector."""
@@ -721,15 +723,16 @@ class LiftOptions(CheckedOptions):
     """Exponent on the overlap fraction in the consensus, >= 0. Larger values down-weight regions that cover more than
     the target region. Needs --consensus True."""
     consensus_sample: int = 50
-    """Maximum number of Gaussians that the consensus samples in each region, at least 1. Larger values are more exact
-    and slower. Needs --consensus True."""
+    """Minimum number of Gaussians that the consensus samples in each region, at least 1. Regions with fewer Gaussians
+    use all of them. Larger values are more exact and slower. Needs --consensus True."""
     consensus_min_agreement: float | None = None
     """Agreement of regions across views, in 0..1, up to which the consensus leaves features unchanged because overlaps
     may be random. Larger values disable the consensus in more scenes. Use 0 if each region shows one object, even
     roughly. None: 0 for masks of SAM and for regions between edges, 0.4 for others. Needs --consensus True."""
     recognition: bool = True
-    """Report how well the lift recognizes regions of views that were left out: half of the views, then the other half.
-    This compares captures, encoders and settings without labels. It does not change the result and costs seconds."""
+    """Report how well regions of one half of the views are recognized from the other half, and vice versa. Use the
+    report to compare captures, encoders and settings without labels. It does not change the result, and takes a few
+    seconds."""
     refine: bool = True
     """Repair directions by a vote among neighboring Gaussians. Each Gaussian copies the direction that wins."""
     vote: RefineConfig = field(default_factory=RefineConfig)
@@ -772,8 +775,8 @@ class AskOptions:
     (from LERF) for text encoders. imagenet and color have none."""
     relevancy: RelevancyRule | Literal["auto"] = "auto"
     """Relevancy formula. contrast: the softmax against unrelated words at every Gaussian. cosine: the cosine itself.
-    lerf: the smallest softmax against any negative. margin: the cosine minus that of the best negative. auto: contrast
-    if the lift compared the scene with unrelated words, else lerf if there are negatives, else cosine."""
+    lerf: the smallest softmax against any negative. margin: the cosine minus the largest cosine of a negative. auto:
+    contrast if the lift compared the scene with unrelated words, else lerf if there are negatives, else cosine."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected. Larger values select fewer Gaussians. auto: a threshold from the
     histogram of relevancies. None: the threshold of the encoder (0.7 for color), or else 0.5 for contrast and lerf,

@@ -40,19 +40,13 @@ from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.null_level import with_null_level
-from normlift_ns.core.refine import clamp_k, labeled_share, refine, unsupported
+from normlift_ns.core.refine import CHANGED_COSINE, clamp_k, labeled_share, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.encoders.base import FeatureSource
-from normlift_ns.encoders.langsplat import check_unique_stems
+from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
 from normlift_ns.encoders.null_words import null_vectors
 from normlift_ns.errors import InputError
-from normlift_ns.evidence_collection import (
-    EvidenceCollection,
-    FeatureExport,
-    RasterConfig,
-    ViewObservations,
-    sample_evenly,
-)
+from normlift_ns.evidence_collection import EvidenceCollection, RasterConfig, ViewObservations, sample_evenly
 from normlift_ns.options import LiftOptions
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
@@ -60,10 +54,8 @@ from normlift_ns.rasterization.rasterize import resolve_backend
 
 _MIN_LIFTED_SHARE = 0.01
 """Share of Gaussians with features, in 0..1, below which `check_directions` warns."""
-CHANGED_COSINE = 0.98
-"""Cosine of the directions before and after the vote below which a Gaussian counts as changed, about 11 degrees."""
 _OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
-"""Kinds of regions that are objects or parts of them."""
+"""Kinds of regions that are objects or parts of objects."""
 _COMPARED = 20_000
 """Approximate number of Gaussians whose directions are compared before and after the vote."""
 _WARM_UP_GAUSSIANS, _WARM_UP_REGIONS = 4096, 4
@@ -197,7 +189,7 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
 def min_agreement(options: LiftOptions, features: Mapping[str, Any] = MappingProxyType({})) -> float:
     """Return the agreement up to which the consensus leaves features unchanged.
 
-    Masks of objects agree by more than chance even if they are damaged. Cells of a partition may not.
+    Masks of objects agree by more than chance even if they are damaged. Cells of a partition may agree only by chance.
 
     Args:
         features: identity of the source of 2D features, as in the manifest.
@@ -258,11 +250,11 @@ def lift_features(
 
 
 def with_stored_reliability(lifted: Lifted, means: Float[Tensor, "n 3"], collection: EvidenceCollection) -> Lifted:
-    """Replace the paper's R by the kind of R to store.
+    """Replace the paper's R with the kind of R that the options select.
 
     Args:
         lifted: lift with the paper's R of the features before the consensus.
-        means: centers of its Gaussians.
+        means: centers of the Gaussians.
     """
     kind, beta, scalars = collection.options.reliability, collection.options.reliability_beta, lifted.scalars
     if kind == "paper":
@@ -322,7 +314,9 @@ def _describe(source: FeatureSource) -> str:
 
 
 def measures_gate(options: LiftOptions, facts: Mapping[str, Any]) -> bool:
-    """Return whether the vote measures its gate, as a posterior vote without --vote-tau does after an active consensus.
+    """Return True if the gate of the vote (tau and gamma) is measured instead of taken from the options.
+
+    It is measured in a posterior vote without --vote-tau, after a consensus that changed features.
 
     Args:
         facts: `consensus_facts`, if the consensus is enabled.
@@ -359,10 +353,10 @@ def vote_directions(
     """Let neighboring Gaussians vote on their directions.
 
     Args:
-        level: level of every region, to measure the gate (default: the gate of the options).
+        level: level of every region, to measure the gate. If None, use the gate of the options.
     Returns:
-        For every Gaussian, the index of the Gaussian whose direction it takes. Also the options with all numbers of the
-        vote, and the gate and the counts for the manifest.
+        The index of the Gaussian whose direction each Gaussian takes, the options with the resolved parameters of the
+        vote, and the manifest entries (the gate and shares of Gaussians).
     """
     reliability, n = lifted.scalars.reliability, len(means)
     gaussians = torch.arange(n, device=means.device)
@@ -387,11 +381,14 @@ def vote_directions(
 def count_changes(
     lifted: Lifted, source: Int64[Tensor, " m"], gaussians: Int64[Tensor, " m"], n: int
 ) -> Int64[Tensor, " 2"]:
-    """Return the number of sampled Gaussians whose direction changes by more than `CHANGED_COSINE`, and of all sampled.
+    """Return the number of sampled Gaussians that change direction, and the number of all sampled Gaussians.
+
+    The direction changes if the cosine between old and new direction is below `CHANGED_COSINE`.
 
     Args:
-        source: rows in the lift of the Gaussians whose directions the first m Gaussians take.
-        gaussians: indices of the first m Gaussians among all n, which decide whether they are sampled.
+        source: row in the lift of the Gaussian that provides the direction, for each of the first m Gaussians.
+        gaussians: indices of the first m Gaussians among all n. A hash of the index decides whether a Gaussian is
+            sampled.
     """
     row = (hash_to_unit(gaussians) < min(1.0, _COMPARED / max(1, n))).nonzero().squeeze(1)
     copies = row[source[row] != row]

@@ -37,8 +37,7 @@ from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.cache import NotCachedError, cached
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, find_local_model, resolve_model_name
 from normlift_ns.encoders.open_clip import has_local_clip_weights
-from normlift_ns.encoders.package_files import EDGES, IMAGENET
-from normlift_ns.encoders.weights import find_local_sam
+from normlift_ns.encoders.weights import EDGES, IMAGENET, find_local_sam
 from normlift_ns.io.memory import free_memory
 from normlift_ns.io.run_dir import FIELD_FOLDER, MANIFEST_FILE, cache_folder, read_manifest, run_directory
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, LiftOptions, SourceOptions
@@ -308,7 +307,7 @@ def measure_core(
 
 
 def _rate(small: tuple[float, float], large: tuple[float, float], count: float) -> Rate:
-    """Fit a line to two pairs of items and cost. It meets the larger pair; slope and fixed part are not negative."""
+    """Fit a line to two pairs of items and cost. It passes through the larger pair; slope and fixed part are >= 0."""
     (items, cost), (more, most) = small, large
     each = (most - cost) / (more - items) if more > items else most / max(1.0, more)
     each = min(max(each, 0.0), most / max(1.0, more))
@@ -387,16 +386,16 @@ def describe_recognition(facts: Mapping[str, Any]) -> str:
 
 
 def diagnose_recognition(run_dirs: Iterable[Path]) -> list[Diagnostic]:
-    """Report how well the first lifted run among some folders recognizes left-out views, from its manifest.
+    """Report how well the first lifted run in the given folders recognizes left-out views, according to its manifest.
 
     Args:
-        run_dirs: folders that may hold a lifted run.
+        run_dirs: folders that may contain a lifted run.
     """
     for run_dir in run_dirs:
         if (run_dir / FIELD_FOLDER / MANIFEST_FILE).is_file():
             facts = read_manifest(run_dir / FIELD_FOLDER)[0].get("statistics", {}).get("recognition")
             if facts is None:
-                advice = "lift again to measure how well it recognizes views that were left out"
+                advice = "lift again to measure how well regions are recognized in left-out views"
                 return [Diagnostic("lifted run", "ok", str(run_dir), advice)]
             return [Diagnostic("lifted run", "ok", describe_recognition(facts))]
     return []
@@ -511,9 +510,8 @@ _MAX_VIEWS = 4
 _MAX_LOAD_S = 3.0
 """Maximum estimate of the seconds to load kernels. Longer times include compilation, which happens only once."""
 _SLOW_FIRST_VIEW_S = 20.0
-"""Seconds for the first view above which only one more batch is measured.
-
-They include an unknown time to load networks.
+"""Seconds for the first view above which only one more batch is measured. The seconds include an unknown time to load
+networks.
 """
 _DIMENSION = 512
 """Dimension of the features for which kernels are loaded."""
@@ -594,7 +592,7 @@ def measure_capture(
         write_s, _ = timed(lambda: evidence.save(file))
         write_bytes_s = file.stat().st_size / max(write_s, 1e-6)
     count = len(block.cameras)
-    device_bytes = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds what the core needs
+    device_bytes = torch.cuda.max_memory_allocated(device) if cuda else None  # the plan adds the memory of the core
     rates, field_bytes = measure_core(gaussians, evidence, torch.cat(block.features), options, len(used), clock)
     groups = ((_joined(list(known.values())), len(known)), (observed.block, len(new)))
     entries = evidence.nnz + evidence.unlabeled.weight.numel()

@@ -34,7 +34,7 @@ class Registry(Generic[Plugin]):
     flag: str
     """Command-line option that selects a plugin."""
     default: str
-    """Name of a plugin that always works, as advice in messages."""
+    """Name of a plugin that always works, which messages suggest as an alternative."""
 
     def names(self) -> list[str]:
         """Return the names of all plugins in alphabetical order, including those that fail to load."""
@@ -70,10 +70,10 @@ class Registry(Generic[Plugin]):
         points = {point.value: point for point in _entry_points(self.group, tuple(sys.path)) if point.name == name}
         if len(points) == 0:
             known = ", ".join(self.names())
-            raise InputError(f"unknown {self.noun} {truncate_text(name)!r}; {self.flag} is one of {known}")
+            raise InputError(f"unknown {self.noun} {truncate_text(name)!r}; {self.flag} must be one of {known}")
         if len(points) > 1:
             packages = " and ".join(f"{_package(point)} ({value})" for value, point in points.items())
-            raise InputError(f"{self.noun} {name!r} is registered by {packages}; uninstall one of the two")
+            raise InputError(f"{self.noun} {name!r} is registered by {packages}; uninstall all but one of them")
         return next(iter(points.values()))
 
 

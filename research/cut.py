@@ -21,7 +21,7 @@ import json
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,8 +29,10 @@ from PIL import Image, ImageDraw
 from torch.nn.functional import normalize
 
 import normlift_ns as nl
+from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import make_source
 from normlift_ns.errors import InputError
+from normlift_ns.options import RelevancyRule
 from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, make_query
 from research.honest_answers import otsu
@@ -73,13 +75,15 @@ def label_masks(capture: str) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
         yield image, whole | {name: np.array(part) for name, part in parts.items()}
 
 
-def region_rows(run: Any, views: dict[str, Any], images: Iterable[str]) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+def region_rows(
+    source: FeatureSource, views: dict[str, Any], images: Iterable[str]
+) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
     """Return the features of every labeled image, and the row of each pixel among them, -1 without one."""
-    source, rows = make_source(nl.SourceOptions(**run.field.manifest["source"]), "cpu"), {}
+    rows = {}
     for image in images:
         found = source.view(views[image].image, views[image].name)
-        cell = found.labels.long()
-        rows[image] = (found.features, torch.where(cell >= 0, found.region_of_cell[0].long()[cell.clamp(min=0)], -1))
+        cell, region = found.labels.long().cpu(), found.region_of_cell[0].long().cpu()
+        rows[image] = (found.features.cpu(), torch.where(cell >= 0, region[cell.clamp(min=0)], -1))
     return rows
 
 
@@ -116,14 +120,28 @@ def candidate_cuts(values: np.ndarray) -> dict[str, float]:
     return {f"median+{f:.1f}": median + f * (top - median) for f in POSITIONS} | {"otsu": otsu(values[values > median])}
 
 
-def measure(report: Report, capture: str, config: Path) -> None:
-    """Add the figures of one lifted capture."""
+class Asked(NamedTuple):
+    """A text that was asked in one capture, with the pixels of the images that show its label."""
+
+    answer: Any
+    values: np.ndarray
+    """Rendered relevancy of every pixel."""
+    truth: np.ndarray
+    in_images: np.ndarray
+    """Cosine of every pixel's region, -1 without one."""
+
+
+def ask(capture: str, config: Path, rule: RelevancyRule = "cosine") -> dict[str, Asked]:
+    """Ask the prototype of every label of a lifted capture, and its word if the encoder knows it."""
     run, masks = nl.open_run(config), dict(label_masks(capture))
     scene, field = run.scene, run.field
     views = {Path(x.name).stem: x for part in (scene.train, scene.held_out) for x in part}
-    rows = region_rows(run, views, masks)
+    rows = region_rows(make_source(nl.SourceOptions.stored(run.field.manifest["source"]), "cpu"), views, masks)
     vectors = prototypes(rows, masks)
-    asked = {name: (name, Query((name,), row[None].numpy(), suggest_threshold=True)) for name, row in vectors.items()}
+    asked = {
+        name: (name, Query((name,), row[None].numpy(), rule=rule, suggest_threshold=True))
+        for name, row in vectors.items()
+    }
     for name in vectors:
         with suppress(InputError):  # a word that the encoder does not know
             asked[f"word {name}"] = (name, make_query(field, run.texts.rows, [name]))
@@ -133,19 +151,29 @@ def measure(report: Report, capture: str, config: Path) -> None:
         image: nl.render(scene.gaussians, views[image].camera, relevancy, rasterize_mode=scene.rasterize_mode)[0]
         for image in masks
     }
-    reached: dict[str, list[tuple[float, float]]] = {}
-    for q, (key, (label, _)) in enumerate(asked.items()):
+    found = {}
+    for q, (key, (label, question)) in enumerate(asked.items()):
         images = [image for image, labels in masks.items() if label in labels]
-        values = np.concatenate([drawn[image][..., q].numpy().ravel() for image in images])
-        truth = np.concatenate([masks[image][label].ravel() for image in images])
-        best, answer = best_cut(values, truth), answers[key]
+        vector = normalize(torch.from_numpy(question.embeddings[0]).float(), dim=0)
+        cosines = [(torch.cat([rows[x][0] @ vector, vector.new_tensor([-1])]), rows[x][1]) for x in images]
+        found[key] = Asked(
+            answers[key],
+            np.concatenate([drawn[image][..., q].numpy().ravel() for image in images]),
+            np.concatenate([masks[image][label].ravel() for image in images]),
+            np.concatenate([cosine[row].numpy().ravel() for cosine, row in cosines]),
+        )
+    return found
+
+
+def measure(report: Report, capture: str, config: Path) -> None:
+    """Add the figures of one lifted capture."""
+    reached: dict[str, list[tuple[float, float]]] = {}
+    for key, (answer, values, truth, in_images) in ask(capture, config).items():
+        best = best_cut(values, truth)
         cuts = {"default": answer.question.threshold}
         if not key.startswith("word "):
             cuts |= candidate_cuts(answer.relevancy[answer.valid, 0].numpy())
         report.add(f"{capture}.{key}.ap", average_precision(values, truth), "of 1")
-        vector = normalize(torch.from_numpy(asked[key][1].embeddings[0]).float(), dim=0)
-        cosines = [(torch.cat([rows[x][0] @ vector, vector.new_tensor([-1])]), rows[x][1]) for x in images]
-        in_images = np.concatenate([cosine[row].numpy().ravel() for cosine, row in cosines])
         report.add(f"{capture}.{key}.images", average_precision(in_images, truth), "of 1, without a lift")
         report.add(f"{capture}.{key}.best", best, "IoU")
         for name, cut in cuts.items():

@@ -29,10 +29,10 @@ def drawn(scene: Scene, name: str, found: CatalogueObject) -> Image.Image:
         there[:, 2] = there[:, 2].clip(min=1e-3)
         return (there @ K.T)[:, :2] / there[:, 2:]
 
-    corners = pixels(found.scene.box.corners)
+    corners = pixels(found.scene.box.corners.numpy())
     for a, b in EDGES:
         pen.line([*map(float, corners[a]), *map(float, corners[b])], fill=(255, 0, 255), width=3)
-    ((x, y),) = pixels(found.scene.centroid[None])
+    ((x, y),) = pixels(found.scene.centroid[None].numpy())
     pen.ellipse([x - 5, y - 5, x + 5, y + 5], fill=(0, 255, 0))
     pen.text((8, 8), f"{found.id} {found.text} {found.gaussians} in {found.views} views", fill=(255, 255, 0))
     return image

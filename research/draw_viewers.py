@@ -1,6 +1,8 @@
 """docs/viewer_own.jpg, viewer_overlay.jpg and viewer_isolated.jpg: both viewers on the demo room, in Chromium.
 
-python -m research.draw_viewers [config.yml of the lifted demo room]      after make demo; nothing is saved in the run
+python -m research.draw_viewers [FOLDER of both lifted runs of the demo]      after make demo; nothing is saved in them
+
+The page searches with the trained networks, the panel in nerfstudio's viewer by color names.
 """
 
 from __future__ import annotations
@@ -17,22 +19,24 @@ from research.plots import DOCS
 from tests.browser.page import OnPage
 from tests.browser.person import PANEL, chromium, coloured
 from tests.browser.server import OWN, Server
-from tests.browser.viewer import TITLE, Tab, ns_viewer
+from tests.browser.server import STOCK as STOCK_VIEWER
+from tests.browser.viewer import TITLE, Tab
 
-CONFIG = Path("demo/outputs/room/normlift/demo/config.yml")
-ASKED, STOCK = "pumpkin, blueberry", "tomato red, banana yellow"
+RUNS = Path("demo/outputs/room/normlift")
+ASKED, STOCK = "banana, wine bottle", "tomato red, banana yellow"
 """Things that the first views of the two viewers show."""
 CLICKED = (0.35, 0.85)
 """Where the pumpkin is in the picture of the first view, as fractions of its width and height."""
 
 
-def main(config: Path) -> None:
+def main(runs: Path) -> None:
     """Draws the three pictures."""
+    config = runs / "demo" / "config.yml"
     log = Path(tempfile.mkdtemp()) / "log"
     with chromium() as browser:
-        with Server(OWN, config, log).running() as address:
+        with Server(OWN, runs / "thing" / "config.yml", log).running() as address:
             own(browser, address)
-        with ns_viewer(config, log, cwd=config.parents[4]) as address:
+        with Server(STOCK_VIEWER, config, log, cwd=config.parents[4]).running() as address:
             stock(browser, address)
 
 
@@ -77,4 +81,4 @@ def shot(page: Page, name: str) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else CONFIG.resolve())
+    main(Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else RUNS.resolve())

@@ -29,7 +29,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from normlift_ns.encoders.base import PatchFeatures
-from normlift_ns.encoders.package_files import EDGES
+from normlift_ns.encoders.weights import EDGES
 from normlift_ns.segmentation.edges import EDGE_COUNTS, WORKING_PIXELS, EdgeRegions, watershed_levels
 from normlift_ns.segmentation.regions import Superpixels, read_image
 from research.front_end_inputs import Size, random_clip

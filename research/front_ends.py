@@ -36,7 +36,8 @@ from normlift_ns.encoders.base import PatchFeatures, RegionFeatures
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
 from normlift_ns.segmentation import sam as network_module
 from normlift_ns.segmentation import sam as sam_module
-from normlift_ns.segmentation.mask_filtering import Suppression, mask_nms, remove_small_regions, stack_masks
+from normlift_ns.segmentation.mask_filtering import Suppression, mask_nms, remove_small_regions
+from normlift_ns.segmentation.regions import stack_masks
 from normlift_ns.segmentation.sam import SAM_LEVELS, MaskRules, SamMasks, SamNetwork, crop_boxes, point_grid
 from research.front_end_inputs import (
     SMALL,

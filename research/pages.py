@@ -1,4 +1,4 @@
-"""Refreshes the tables of the pages in docs/ that `PAGES` names, and the plots, from research/results/*.json.
+"""Refreshes the tables of the pages that `PAGES` names, and the plots, from research/results/*.json.
 
     python -m research.pages            writes tables and plots
     python -m research.pages --check    writes nothing; fails and names the tables that are out of date, if any are
@@ -21,14 +21,15 @@ from research.plots import DOCS, plots
 from research.tables import tables
 
 PAGES = (
-    "accuracy.md",
-    "speed_and_error.md",
-    "numerics.md",
-    "reliability.md",
-    "front_ends.md",
-    "check.md",
-    "splats.md",
-    "paper.md",
+    "docs/accuracy.md",
+    "docs/speed_and_error.md",
+    "docs/numerics.md",
+    "docs/reliability.md",
+    "docs/front_ends.md",
+    "docs/check.md",
+    "docs/splats.md",
+    "docs/paper.md",
+    "research/studies.md",
 )
 MARKER = re.compile(r"<!-- (?:table: (?P<name>[\w-]+)|end) -->")
 LIKE_A_MARKER = re.compile(r"<!--\s*(table|end)\b", re.IGNORECASE)
@@ -90,7 +91,7 @@ def refreshed(text: str, made: Mapping[str, str]) -> str:
     return "".join(part.text if part.table is None else made[part.table] for part in split(text, made))
 
 
-def main(check: bool, folder: Path = DOCS) -> None:
+def main(check: bool, folder: Path = DOCS.parent) -> None:
     found = documents()
     made, stale, new = tables(found), [], {}
     for path in (folder / name for name in PAGES):
@@ -106,7 +107,7 @@ def main(check: bool, folder: Path = DOCS) -> None:
         return
     for path, content in new.items():
         path.write_bytes(content)
-    print("Written: " + ", ".join(map(str, [*new, *plots(found, folder)])))
+    print("Written: " + ", ".join(map(str, [*new, *plots(found, folder / DOCS.name)])))
 
 
 if __name__ == "__main__":

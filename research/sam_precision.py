@@ -25,7 +25,8 @@ from torch.nn import Conv2d, ConvTranspose2d, Embedding, Linear
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits
 
 from normlift_ns.options import SamPrecision
-from normlift_ns.segmentation.mask_filtering import Suppression, stack_masks
+from normlift_ns.segmentation.mask_filtering import Suppression
+from normlift_ns.segmentation.regions import stack_masks
 from normlift_ns.segmentation.sam import SAM_LEVELS, MaskRules, SamLevel, SamMasks, SamNetwork, crop_boxes, point_grid
 from research.report import RESULTS, Report
 

@@ -1,4 +1,4 @@
-"""What mkdocs.yml asks of the documentation: pages from outside of docs/, and examples in docstrings as code.
+"""What mkdocs.yml asks of the documentation: pages from outside of docs/, an index, and examples in docstrings as code.
 
 README, CONTRIBUTING, SECURITY and CHANGELOG stay where people look for them, and are pages of the site as well.
 """
@@ -27,6 +27,7 @@ OUTSIDE = {
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
     "CHANGELOG.md": "changelog.md",
+    "research/studies.md": "studies.md",
 }
 _SOURCE = "https://github.com/normlift-ns/normlift_ns/blob/main/"
 _LINK = re.compile(r"\]\((?!https?:|#)([^)#]+)(#[^)]*)?\)")
@@ -44,10 +45,39 @@ def on_files(files: Files, config: Any) -> Files:
     """Adds the pages from outside, and MathJax."""
     for name, page in OUTSIDE.items():
         files.append(File.generated(config, page, content=(ROOT / name).read_text("utf8")))
+    files.append(File.generated(config, "index_of_options.md", content=index_of_options()))
     script = mathjax()
     if script is not None:
         files.append(File.generated(config, "assets/tex-svg.js", content=script))
     return files
+
+
+def index_of_options() -> str:
+    """A page with a heading for every option and every message, which the search finds by its name."""
+    pages = {name: (ROOT / "docs" / f"{name}.md").read_text("utf8") for name in ("options", "troubleshooting")}
+    options, messages, command = dict[str, dict[str, list[str]]](), [], ""
+    for line in pages["options"].splitlines():
+        command = line[3:].partition(":")[0] if line.startswith("## ") else command
+        flag, cells = _cells(line)
+        if flag.startswith("`--"):
+            options.setdefault(flag, {}).setdefault(cells[-1], []).append(command)
+    for line in pages["troubleshooting"].splitlines():
+        message, cells = _cells(line)
+        if message.startswith("`"):
+            messages.append(f"### {message}\n\n{cells[0]}\n")
+    told = [
+        f"### {flag}\n\n" + "".join(f"{text} ({', '.join(names)})\n\n" for text, names in texts.items())
+        for flag, texts in sorted(options.items())
+    ]
+    head = "---\nhide: [toc]\nsearch:\n  boost: 3\n---\n\n# Options and messages, by name\n\n"
+    head += "Defaults and ranges are under [options](options.md).\n"
+    return "\n".join([head, "## Options\n", *told, "## Messages\n", *messages])
+
+
+def _cells(line: str) -> tuple[str, list[str]]:
+    """The first cell of a row of a table, and the others; of another line, an empty one."""
+    cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] if line.startswith("|") else [""]
+    return cells[0], cells[1:]
 
 
 def mathjax() -> bytes | None:

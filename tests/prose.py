@@ -27,7 +27,8 @@ BRITISH = re.compile(
 )
 ALLOWED = {
     r"""--encoder colour\b|["']colour["']|\bcolour:""": "name of an encoder, in options and in lifted runs",
-    r"^((make|write)_catalogue|catalogue(_to_json)?|Catalogue(Object)?)$|\.catalogue\(|`catalogue`": "Python names",
+    r"^((make|write)_catalogue|catalogue(_to_json)?|Catalogue(Object)?)$|\.catalogue\(": "Python names",
+    r"`(make_)?catalogue`": "the same names in docstrings",
     r'\bmetres_per_unit\b|"metre"': "old name of an option, and JSON value of the catalog of objects",
     r'^"?centre"?$': "JSON key of the coverage report",
     r'"grey"|\bgrey[- ]green\b': "spelling of the XKCD color survey",

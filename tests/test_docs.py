@@ -36,14 +36,15 @@ def made(pages):
 @pytest.fixture
 def folder(pages, tmp_path):
     for name in pages.PAGES:
-        shutil.copy(pages.DOCS / name, tmp_path / name)
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(pages.DOCS.parent / name, tmp_path / name)
     return tmp_path
 
 
 def test_tables_of_the_pages_are_those_of_the_results_and_every_table_stands_on_one(pages, made):
     shown = set()
     for name in pages.PAGES:
-        text = (pages.DOCS / name).read_bytes().decode()
+        text = (pages.DOCS.parent / name).read_bytes().decode()
         assert pages.outdated(text, made) == [], "refresh them: python -m research.pages"
         assert pages.refreshed(text, made) == text
         shown |= {part.table for part in pages.split(text, made)}
@@ -74,21 +75,21 @@ def test_a_refresh_changes_tables_alone_and_refuses_wrong_markers(pages):
 
 def test_check_names_the_page_and_the_table_and_a_refresh_writes_all_or_nothing(pages, folder, monkeypatch, capsys):
     pages.main(check=True, folder=folder)
-    page = folder / "accuracy.md"
+    page = folder / "research" / "studies.md"
     stale = page.read_text().replace("| fitted, for `--vote paper` | 36 |", "| fitted, for `--vote paper` | 48 |")
     page.write_text(stale)
     with pytest.raises(SystemExit) as stopped:
         pages.main(check=True, folder=folder)
-    assert "accuracy.md: table parameters" in str(stopped.value)  # a message is exit status 1
+    assert "studies.md: table parameters" in str(stopped.value)  # a message is exit status 1
     assert page.read_text() == stale
-    assert sorted(path.name for path in folder.iterdir()) == sorted(pages.PAGES)
+    assert sorted(str(path.relative_to(folder)) for path in folder.glob("*/*")) == sorted(pages.PAGES)
     assert capsys.readouterr().out == ""
     monkeypatch.setattr(pages, "plots", lambda found, folder: [])
-    bad = folder / "speed_and_error.md"
+    bad = folder / "docs" / "speed_and_error.md"
     bad.write_text(bad.read_text() + "<!-- end -->\n")
     with pytest.raises(SystemExit, match=r"speed_and_error.md, line \d+"):
         pages.main(check=False, folder=folder)
     assert page.read_text() == stale
     bad.write_text(bad.read_text().removesuffix("<!-- end -->\n"))
     pages.main(check=False, folder=folder)
-    assert all((folder / name).read_bytes() == (pages.DOCS / name).read_bytes() for name in pages.PAGES)
+    assert all((folder / name).read_bytes() == (pages.DOCS.parent / name).read_bytes() for name in pages.PAGES)

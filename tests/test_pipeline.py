@@ -23,7 +23,7 @@ from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.data.images import ImageViews
 from normlift_ns.encoders.base import FeatureSource, RegionFeatures, ViewFeatures, precomputed_features
 from normlift_ns.encoders.color import ColorEncoder
-from normlift_ns.encoders.langsplat import LangSplat
+from normlift_ns.encoders.langsplat import FeatureExport, LangSplat
 from normlift_ns.evaluation.lerf import run_lerf
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, mask_truth

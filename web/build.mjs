@@ -1,4 +1,4 @@
-/** Builds the page into normlift_ns/page, with the licenses of the packages in it. */
+/** Build the page into normlift_ns/page, with the licenses of the packages that it contains. */
 import { cp, mkdir, readFile, rm, writeFile } from "node:fs/promises";
 import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
@@ -29,7 +29,7 @@ for (const name of ["page.js", "style.css"]) {
   await writeFile(`${path}.gz`, gzipSync(await readFile(path), { level: 9 }));
 }
 
-// Spark carries fflate in itself
+// Spark bundles fflate
 const names = Object.keys(metafile.inputs).map((path) => path.match(/node_modules\/((?:@[^/]+\/)?[^/]+)/)?.[1]);
 const packages = [...new Set([...names.filter(Boolean), "fflate"])].sort();
 const licenses = packages.map(async (name) => {

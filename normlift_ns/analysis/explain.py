@@ -9,7 +9,7 @@ the unit feature of region s::
     C_inter = ||sum_v S_v|| / sum_v ||S_v||    and norm, C_intra, N_eff, R as in `core.lift`
 
 The disagreement 1 - C_inter is the sum over images of ||S_v|| (1 - a_v) / sum_v ||S_v||. The images that disagree most
-have the largest terms. If a Gaussian copied the direction of a neighbor, the neighbor's evidence replaces its own.
+have the largest terms. If a Gaussian has the direction of a neighbor, the neighbor's evidence replaces its own.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.lift import lift
 from normlift_ns.core.lowrank import StoredEvidence
+from normlift_ns.core.refine import CHANGED_COSINE
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.base import FeatureSource
@@ -69,11 +70,11 @@ class ViewVote:
     weight: float
     """W_v, in pixels."""
     share: float
-    """Fraction of the weight of all images in this image, in 0..1."""
+    """Weight of this image as a fraction of the weight of all images, in 0..1."""
     agreement: float
     """a_v, in -1..1."""
     disagreement: float
-    """Fraction of the total disagreement from this image, in 0..1; 0 if all images agree."""
+    """Fraction of the total disagreement that comes from this image, in 0..1; 0 if all images agree."""
     regions: tuple[RegionVote, ...]
     """Regions by descending weight; together they have at least 90 % of the image's weight."""
 
@@ -98,8 +99,9 @@ class Why:
 
     gaussians: int
     """Number of selected Gaussians."""
-    copied: int
-    """Number of selected Gaussians that copied the direction of a neighbor."""
+    changed: float
+    """Share of the selected Gaussians whose answer the vote changed, in 0..1: their direction has a cosine below 0.98
+    to their own. It is estimated from at most 4,096 of them."""
     norm: float
     c_intra: float
     c_inter: float
@@ -119,29 +121,31 @@ class Why:
     def words(self) -> str:
         """Agreement of the images and their effective number, as English sentences.
 
-        >>> Why(5, 0, 0.9, 1.0, 0.97, 3.2, 0.7, ()).words
+        >>> Why(5, 0.0, 0.9, 1.0, 0.97, 3.2, 0.7, ()).words
         'The images agree (C_inter 0.97). Their weights are equivalent to 3.2 images of equal weight (N_eff).'
         """
         if len(self.views) == 0 and self.n_eff == 0:
             return "No image shows the selection."
         if len(self.views) == 1:
-            return "Only one image shows the selection, so there is no other image to confirm it."
+            return "Only one image shows the selection, so no other image can confirm its features."
         level = next(words for least, words in _LEVELS if self.c_inter >= least)
         count = "a single image" if self.n_eff < 1.05 else f"{self.n_eff:.1f} images of equal weight"
         return f"The images {level} (C_inter {self.c_inter:.2f}). Their weights are equivalent to {count} (N_eff)."
 
     @property
     def sentence(self) -> str:
-        """`words`, with the fraction of the selection that copied the direction of a neighbor."""
-        if self.copied == 0:
+        """Sentences of `words`, and the share of the answers that the vote changed."""
+        if self.changed == 0:
             return self.words
-        return f"{self.words} {self.copied / self.gaussians:.0%} of the selection copied the direction of a neighbor."
+        return f"{self.words} The vote of neighboring Gaussians changed {self.changed:.0%} of the answers."
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields and the words as plain Python types."""
         return {**asdict(self), "words": self.words}
 
 
+_COMPARED = 4096
+"""Largest number of Gaussians whose directions before and after the vote are compared."""
 _LEVELS = (
     (0.95, "agree"),
     (0.85, "agree with few exceptions"),
@@ -184,11 +188,21 @@ def explain_selection(
     }
     table = features.to(joined.rows.weight.device)[joined.rows.column.long()].double()
     views = _votes(joined, torch.nn.functional.normalize(table, dim=1))
-    return Why(len(rows), int((origin != rows).sum()), **scalars, views=views)
+    return Why(len(rows), _changed_share(evidence, features, rows, origin), **scalars, views=views)
+
+
+def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: Tensor) -> float:
+    """Return the share of the Gaussians `rows` whose direction differs from that of `origin`."""
+    step = -(-len(rows) // _COMPARED)
+    rows, origin = rows[::step], origin[::step]
+    other, table = rows != origin, torch.nn.functional.normalize(features.to(rows.device).float(), dim=1)
+    sums = (evidence.rows.select_rows(x[other]).sums_of_unit_rows(table) for x in (rows, origin))
+    own, used = (torch.nn.functional.normalize(x, dim=1) for x in sums)
+    return int(((own * used).sum(dim=1) < CHANGED_COSINE).sum()) / len(rows)
 
 
 def _summed(evidence: Evidence, rows: Tensor) -> Evidence:
-    """Return the sum of the evidence of the Gaussians `rows` as one row; a Gaussian counts once per occurrence."""
+    """Return the sum of the evidence of the Gaussians `rows` as one row; repeated Gaussians count repeatedly."""
     parts = []
     for matrix, columns in ((evidence.rows, evidence.num_regions), (evidence.unlabeled, evidence.num_views)):
         selected = matrix.select_rows(rows)
@@ -201,7 +215,7 @@ def _summed(evidence: Evidence, rows: Tensor) -> Evidence:
 
 
 def _votes(joined: Evidence, table: Float64[Tensor, "r d"]) -> tuple[ViewVote, ...]:
-    """Return one vote per image, from evidence with a single row and the features of its entries."""
+    """Return one vote per image, from evidence with a single row and the features of the entries of that row."""
     column, weight = joined.rows.column.long(), joined.rows.weight
     view = joined.region_view[column].long()
     total = torch.zeros(joined.num_views, dtype=torch.float64, device=weight.device).index_add_(0, view, weight)
@@ -268,7 +282,7 @@ def _eroded(masks: Bool[Tensor, "r h w"], width: int) -> Bool[Tensor, "r h w"]:
 
 
 _FEATURE_TOLERANCE = 1e-3
-"""Maximum difference between a stored feature and the same feature after recomputation."""
+"""Maximum difference between the numbers of a stored feature and of the same feature after recomputation."""
 
 
 class VoteImage(NamedTuple):
@@ -288,14 +302,15 @@ class RecordedVotes:
     scene: Scene
     field: SemanticField
     cache: Path
-    """Folder of the cache of 2D features and evidence."""
+    """Folder of cached 2D features and evidence."""
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the images in the order of the lift.
 
         Raises:
-            ValueError: the run does not record the names, or the dataset no longer has all images.
+            ValueError: the run does not record the names or has evidence of a different number of images, or the
+                dataset no longer has all images.
         """
         names = self.field.manifest.get("views_lifted")
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -321,7 +336,7 @@ class RecordedVotes:
         """Explain a selection by the votes of the images; see `explain_selection`.
 
         Args:
-            refined: use the evidence of the neighbor for a Gaussian that copied the direction of this neighbor.
+            refined: for a Gaussian that took over the direction of a neighbor, use the evidence of that neighbor.
         Raises:
             ValueError: nothing is selected, or the votes are no longer in the cache.
         """

@@ -1,38 +1,42 @@
 """Objects of a scene without prompts: parts whose Gaussians share regions in the images.
 
-Each image in which two neighboring Gaussians have a region gives this pair a count. The count is 1 if both have the
-same region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s = 1 - median
-||f_j|| is the usual disagreement of the views. The affinity of two parts is the mean of the counts over all images and
+Two neighboring Gaussians get a count from each image in which both have a region. The count is 1 if both have the same
+region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s = 1 - median ||f_j||
+measures how much the views usually disagree. The affinity of two parts is the mean of the counts over all images and
 all pairs of neighbors across their border::
 
     a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
 
 Here, m is the median number of images per pair. The square root estimates the length of the border, which is a line on
-a surface. It separates parts that touch at only a few pairs. Initially, every Gaussian is a part. Each part joins the
-part with the largest affinity if that part is larger. This is repeated for affinities of at least 0.95, then 0.9, and
-so on down to 0.5. It corresponds to the ultrametric contour map of image segmentation (Arbelaez et al., "Contour
-Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of edge strengths. Random
-borders of a segmentation differ between images, so their affinity is high; borders of objects are the same in all
-images.
+a surface. This denominator keeps two parts separate if only a few pairs connect them. Initially, every Gaussian is a
+part. Each part joins the part with the largest affinity if that part is larger. This is repeated for affinities of at
+least 0.95, then 0.9, and so on down to 0.5. The method corresponds to the ultrametric contour map of image segmentation
+(Arbelaez et al., "Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of
+edge strengths. Random borders of a segmentation differ between images, so the affinity across them is high. Borders of
+objects are the same in all images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int32, Int64
 from torch import Tensor
 
-from normlift_ns.analysis.objects import Catalogue, Instances
+from normlift_ns.analysis.explain import RecordedVotes
+from normlift_ns.analysis.objects import Catalogue, Instances, SimilarityTransform, make_catalogue
 from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.field import SemanticField
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.errors import InputError
-from normlift_ns.options import OBJECT_MIN_GAUSSIANS
+from normlift_ns.encoders.null_words import null_words
+from normlift_ns.encoders.registry import EncoderKind, find_encoder_kind
+from normlift_ns.errors import InputError, truncate_text
+from normlift_ns.options import OBJECT_MIN_GAUSSIANS, check_prompt_list
 
 MAX_OBJECTS = 20
 """Maximum number of objects in an inventory."""
@@ -42,11 +46,17 @@ _NEIGHBORS = 8
 _MIN_VISIBLE = 0.25
 """Minimum weight of a Gaussian in an image that shows it, as a fraction of its largest weight in any image."""
 _MIN_REGION = 0.25
-"""Minimum fraction of a Gaussian's weight in an image that its region must have; the weight includes all levels."""
+"""Minimum weight of a Gaussian in its region of an image, as a fraction of its weight in this image over all levels."""
 _SPREADS = 3.0
 """Disagreement of two regions at which their similarity is 0, as a multiple of the usual disagreement."""
 _LEVELS = tuple(level / 20 for level in range(19, 9, -1))
 """Minimum affinities of the successive rounds of joining, from 0.95 to 0.5."""
+_MANY_WORDS = 100
+"""Minimum number of words for the test of names against chance."""
+_FALSE_NAMES = 0.25
+"""Expected number of wrong names that the test allows."""
+_SAMPLE = 5000
+"""Approximate number of Gaussians in the sample of the scene with which names are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +79,48 @@ class Inventory:
             ValueError: the inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
-            raise InputError(f"There is no object {number}. The inventory has objects 1 to {len(self)}.")
+            raise InputError(f"Object {number} is not in the inventory, which has objects 1 to {len(self)}.")
         return self.instance_id == number
 
 
+@dataclass(frozen=True)
+class Vocabulary:
+    """Candidate names of objects, with the text encoder and the queries of a run."""
+
+    words: tuple[str, ...]
+    kind: EncoderKind | None
+    """Encoder of the run; None if it is unknown."""
+    encode: Callable[[Sequence[str]], Float[np.ndarray, "w d"]]
+    """Function from words to unit vectors."""
+    ask: Callable[[Sequence[str]], Any]
+    """Function from words to the `Answer` of a query."""
+
+    @classmethod
+    def of(
+        cls,
+        words: Sequence[str],
+        encoder: str | None,
+        encode: Callable[[Sequence[str]], Float[np.ndarray, "w d"]],
+        ask: Callable[[Sequence[str]], Any],
+    ) -> Vocabulary:
+        """Return a vocabulary without duplicates for the encoder with this name.
+
+        Raises:
+            ValueError: a word is empty, or the encoder cannot encode it.
+        """
+        words, kind = tuple(dict.fromkeys(words)), find_encoder_kind(encoder)
+        check_prompt_list("vocabulary", words)
+        unknown = [word for word in words if kind is not None and not kind.known_words(word)]
+        if len(unknown) > 0:
+            raise InputError(
+                f"the encoder of the run cannot encode {len(unknown)} of the {len(words)} words of the vocabulary; "
+                f"remove them: {truncate_text(', '.join(unknown), 400)}"
+            )
+        return cls(words, kind, encode, ask)
+
+
 class ViewRegions(NamedTuple):
-    """M Gaussians that an image shows, and the region of each, as a column of the evidence."""
+    """Gaussians [M] that an image shows, and the region of each as a column index of the evidence."""
 
     gaussian: Int64[Tensor, " m"]
     region: Int64[Tensor, " m"]
@@ -98,13 +144,40 @@ class _Borders(NamedTuple):
         return _Borders(key // len(part), key % len(part), *sums)
 
 
+def list_inventory(
+    votes: RecordedVotes,
+    vocabulary: Vocabulary,
+    transform: SimilarityTransform,
+    *,
+    meters_per_unit: float | None = None,
+    device: str = "cpu",
+) -> Inventory:
+    """Find the main objects of a scene, name them, and list them.
+
+    Args:
+        votes: evidence of the lift, with its scene and its field.
+        vocabulary: candidate names. An object keeps its number as its name if none of them fits.
+        transform, meters_per_unit, device: as in `make_catalogue`.
+    Raises:
+        ValueError, FileNotFoundError: as in `RecordedVotes.table` and `make_catalogue`.
+    """
+    scene, field = votes.scene, votes.field
+    (evidence, features), norm = votes.table, field.scalars.norm
+    spread = 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
+    instance_id = find_inventory(evidence, features, scene.gaussians.means, spread)
+    names = name_objects(field, instance_id, mean_directions(evidence, features, instance_id), vocabulary)
+    instances = as_instances(instance_id, names)
+    catalog = make_catalogue(scene, field, instances, transform, meters_per_unit=meters_per_unit, device=device)
+    return Inventory(instance_id, catalog)
+
+
 def find_inventory(
     evidence: Evidence,
     features: Float[Tensor, "s d"],
     means: Float[Tensor, "n 3"],
     spread: float,
 ) -> Int32[Tensor, " n"]:
-    """Find the main objects of a scene; return the number of the object of every Gaussian, 0 for none.
+    """Find the main objects of a scene; return the object number of every Gaussian, 0 for none.
 
     There are at most 20 objects, numbered from 1 by descending evidence. Each has at least 20 Gaussians, and at least a
     thousandth of the evidence of all images.
@@ -151,7 +224,7 @@ def view_regions(evidence: Evidence) -> Iterator[ViewRegions]:
 def _neighbor_borders(
     views: Iterable[ViewRegions], features: Float[Tensor, "s d"], means: Float[Tensor, "n 3"], spread: float
 ) -> _Borders:
-    """Return the borders between every Gaussian and its nearest neighbors, with every Gaussian as a part."""
+    """Return the borders between every Gaussian and its nearest neighbors; each Gaussian is a part of its own."""
     neighbors = nearest_neighbors(means, _NEIGHBORS).index.long()
     here = torch.arange(len(means))[:, None].expand_as(neighbors)
     low, high = torch.minimum(here, neighbors), torch.maximum(here, neighbors)
@@ -171,7 +244,7 @@ def _neighbor_borders(
 
 
 def _similarity(one: Tensor, other: Tensor, features: Tensor, spread: float) -> Float64[Tensor, " p"]:
-    """Return the counts of P pairs of regions of one image, 1 if both are the same region."""
+    """Return the count of each of P pairs of regions of one image; it is 1 if both are the same region."""
     count = torch.ones(len(one), dtype=torch.float64)
     differs = (one != other).nonzero().squeeze(1)
     key, index = (one[differs] * len(features) + other[differs]).unique(return_inverse=True)
@@ -201,10 +274,10 @@ def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
 def _targets(
     borders: _Borders, affinity: Float64[np.ndarray, " e"], size: Float64[np.ndarray, " n"], chosen: np.ndarray
 ) -> Int64[np.ndarray, " n"]:
-    """Return the part that each part joins, which is the larger part with the largest affinity, or itself.
+    """Return the part that each part joins: the larger part with the largest affinity, or itself.
 
-    Only the borders in the mask `chosen` count. Ties go to the larger part, then to the part with the smaller index. Of
-    two equally large parts, the part with the smaller index counts as larger.
+    Only the borders with the indices `chosen` count. Ties go to the larger part, then to the part with the smaller
+    index. Of two equally large parts, the part with the smaller index counts as larger.
     """
     source = np.concatenate([borders.first[chosen], borders.second[chosen]])
     target = np.concatenate([borders.second[chosen], borders.first[chosen]])
@@ -236,6 +309,42 @@ def mean_directions(
     return torch.nn.functional.normalize(weight.view(count + 1, -1)[1:] @ features.to(weight), dim=1)
 
 
+def name_objects(
+    field: SemanticField, instance_id: Int32[Tensor, " n"], directions: Float64[Tensor, "m d"], vocabulary: Vocabulary
+) -> tuple[str, ...]:
+    """Return the name of every object, which is a word of the vocabulary or a number such as "object 3".
+
+    The word must be the best name, have the verdict "found", and select more than half of the object.
+
+    Args:
+        directions: unit directions of the objects, from `mean_directions`.
+    """
+    names = [f"object {number}" for number in range(1, len(directions) + 1)]
+    if len(vocabulary.words) == 0 or len(names) == 0:
+        return tuple(names)
+    chosen = _words_of_objects(field, directions, vocabulary)
+    answer = vocabulary.ask(tuple(dict.fromkeys(chosen.values()))) if len(chosen) > 0 else {}
+    for number, word in chosen.items():
+        selected = torch.as_tensor(answer[word].mask)[instance_id == number]
+        if answer[word].verdict == "found" and float(selected.float().mean()) > 0.5:
+            names[number - 1] = word
+    return tuple(names)
+
+
+def _words_of_objects(
+    field: SemanticField, directions: Float64[Tensor, "m d"], vocabulary: Vocabulary
+) -> dict[int, str]:
+    """Return the best name of each object for which a word stands out, by the number of the object."""
+    words, kind = vocabulary.words, vocabulary.kind
+    others = null_words() if kind is not None and kind.has_null_words and len(words) < _MANY_WORDS else ()
+    compared = tuple(dict.fromkeys((*words, *others)))
+    absolute = len(compared) < _MANY_WORDS or (kind is not None and kind.present_from is not None)
+    sample = field.directions(torch.arange(0, len(field), max(1, len(field) // _SAMPLE)))
+    vectors, limit = torch.from_numpy(vocabulary.encode(compared)), float("inf") if absolute else _FALSE_NAMES
+    best = best_words(directions, sample, vectors, by_chance=limit, count=len(words))
+    return {number: words[index] for number, index in enumerate(best, 1) if index is not None}
+
+
 def best_words(
     directions: Float64[Tensor, "m d"],
     scene: Float[Tensor, "k d"],
@@ -247,15 +356,15 @@ def best_words(
     """Return the index of the best name of every object; None if the best name does not stand out from other words.
 
     Some words are similar to everything. The cosines of each word are therefore standardized over the scene, and then
-    those of each object over the words that are not names. If these scores were normally distributed, `by_chance` pairs
-    of an object and a name would exceed the limit. The score of the best name must exceed this limit. If all words are
-    names, the scores are standardized over all words, and the best name must also have the best score.
+    those of each object over the words that are not names. The score of the best name must exceed a limit. If the
+    scores were normally distributed, `by_chance` pairs of an object and a name would exceed this limit. If all words
+    are names, the scores are standardized over all words, and the best name must also have the best score.
 
     Args:
         directions: unit directions of the objects, from `mean_directions`.
         scene: directions of a sample of the Gaussians of the scene.
         vectors: one unit row per word, names first.
-        by_chance: number of pairs that may exceed the limit by chance; inf accepts every best name.
+        by_chance: expected number of pairs that exceed the limit by chance; inf accepts every best name.
         count: number of words that are names.
     """
     cosine = directions @ vectors.to(directions).T

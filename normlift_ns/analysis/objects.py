@@ -37,7 +37,7 @@ _FLAT = 1e-14
 _DIRECTIONS = np.array([
     direction for direction in product((-1, 0, 1), repeat=3) if direction > (0, 0, 0)
 ], dtype=np.float64)  # fmt: skip
-"""The 13 directions to the faces, edges and corners of a cube: every direction is within 28 degrees of one of them."""
+"""The 13 axes through opposite faces, edges and corners of a cube. Every line is within 28 degrees of one of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,22 +49,22 @@ class OrientedBox:
     ([8.0, 4.0, 2.0], [4.0, 2.0, 1.0], [1.0, 0.0, 0.0])
     """
 
-    center: Float64[np.ndarray, " 3"]
-    size: Float64[np.ndarray, " 3"]
+    center: Float64[Tensor, " 3"]
+    size: Float64[Tensor, " 3"]
     """Edge lengths in descending order."""
-    axes: Float64[np.ndarray, "3 3"]
+    axes: Float64[Tensor, "3 3"]
     """Unit vectors along the edges, one per row, which form a right-handed system."""
 
     @property
-    def corners(self) -> Float64[np.ndarray, "8 3"]:
+    def corners(self) -> Float64[Tensor, "8 3"]:
         """The eight corners. Bits a, b, c of index 4 a + 2 b + c select the far end of axes 0, 1 and 2."""
-        signs = np.array(list(product((-0.5, 0.5), repeat=3)))
+        signs = torch.tensor(list(product((-0.5, 0.5), repeat=3)), dtype=torch.float64)
         return self.center + (signs * self.size) @ self.axes
 
     def transformed(self, by: SimilarityTransform) -> OrientedBox:
         """Return the transformed box."""
-        center = by.scale * by.rotation @ self.center + by.shift
-        return OrientedBox(center, by.scale * self.size, self.axes @ by.rotation.T)
+        center = torch.from_numpy(by.transform_points(self.center.numpy()[None])[0])
+        return OrientedBox(center, by.scale * self.size, self.axes @ torch.from_numpy(by.rotation).T)
 
 
 def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
@@ -75,7 +75,7 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
     the 1st to the 99th percentile of all points.
 
     Raises:
-        ValueError: there are no points, or some are not finite.
+        ValueError: `points` is empty or contains numbers that are not finite.
     """
     if len(points) == 0 or not np.isfinite(points).all():
         raise InputError(f"a box needs one or more points, all finite; got {len(points)} points")
@@ -86,11 +86,11 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
     if np.linalg.det(axes) < 0:
         axes[2] *= -1
     low, high = np.quantile(points @ axes.T, BOX_QUANTILES, axis=0)
-    return OrientedBox((low + high) / 2 @ axes, high - low, axes)
+    return OrientedBox(*map(torch.from_numpy, ((low + high) / 2 @ axes, high - low, axes)))
 
 
 def _central(points: Float64[np.ndarray, "m 3"]) -> np.ndarray:
-    """Return a mask of the points that are not outliers along any direction; True for all if no such point exists."""
+    """Return a mask of the points that are not outliers along any direction; if there are none, True for all points."""
     along = points @ _DIRECTIONS.T
     low, high = np.quantile(along, BOX_QUANTILES, axis=0)
     inside = ((along >= low) & (along <= high)).all(axis=1)
@@ -124,8 +124,13 @@ class SceneObject:
     """Number of Gaussians."""
     centroid: list[float]
     box: dict[str, list[float]]
-    """Corners "min" and "max" of the axis-aligned bounding box of the centers."""
+    """Corners "min" and "max" of the axis-aligned bounding box of the centers: lists, in this version; see `bounds`."""
     mean_reliability: float
+
+    @property
+    def bounds(self) -> Float64[Tensor, "2 3"]:
+        """Lowest and highest corner of the axis-aligned bounding box of the centers."""
+        return torch.tensor([self.box["min"], self.box["max"]], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -161,13 +166,13 @@ def find_objects(
 
 
 def _objects(field: SemanticField, means: Tensor, selected: Tensor, ids: Tensor, listed: Iterable[int]) -> Objects:
-    """Summarize the listed objects; `ids` is the number of the object of every Gaussian, 0 for none."""
+    """Summarize the listed objects; `ids` is the object number of every Gaussian, 0 for none."""
     small = int((selected & (ids == 0)).sum())
     return Objects(int(selected.sum()), small, [describe_object(field, means, ids == i) for i in listed])
 
 
 def _large_components(means: Tensor, selected: Tensor, max_gap: float, min_gaussians: int) -> tuple[Tensor, int]:
-    """Label connected components, with -1 for those that are too small; return labels and number of components."""
+    """Label large connected components; return the labels (-1 outside of them) and the number of components."""
     check_number("object_min_gaussians", min_gaussians, int)
     labels = connected_components(means, selected, max_gap=max_gap)
     count = int((torch.bincount(labels[labels >= 0].long()) >= min_gaussians).sum())  # sizes are in descending order
@@ -240,10 +245,11 @@ class Instances:
     instance_id: Int32[Tensor, " n"]
     """Object of each Gaussian, numbered 1, 2, … over all prompts, by descending size within each prompt. It is 0 for
     Gaussians without a class or in a component that is too small. The objects of a prompt are the components of its own
-    selection, so further prompts change no number.
+    selection, so further prompts do not change existing numbers.
     """
     classes: tuple[int, ...]
-    """Class of each object, starting with object 1. An object has no Gaussians left if other prompts took them all."""
+    """Class of each object, starting with object 1. An object has no Gaussians if all of them belong to other
+    prompts."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the names of all classes and objects, by id, as plain Python types."""
@@ -282,7 +288,8 @@ def find_instances(
 ) -> Instances:
     """Assign each selected Gaussian to a class and an object.
 
-    A Gaussian that several prompts select belongs to the prompt with the highest relevancy, and to its object there.
+    A Gaussian that several prompts select belongs to the prompt with the highest relevancy, and to the object of this
+    prompt that contains it.
 
     Args:
         texts: prompts.
@@ -307,7 +314,7 @@ def find_instances(
 
 
 def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: Instances) -> list[dict[str, Any]]:
-    """Return a summary of each prompt and its objects with Gaussians, as plain Python types."""
+    """Return a summary of each prompt and of its objects that have Gaussians, as plain Python types."""
     tables, sizes = [], torch.bincount(instances.instance_id.long(), minlength=len(instances.classes) + 1)
     for number, text in enumerate(instances.texts, 1):
         in_class = instances.class_id == number
@@ -321,7 +328,7 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
 MIN_VIEW_SHARE = 0.1
 """Minimum area of an object in an image that shows it, as a fraction of its largest area in any image."""
 MIN_WHOLE_FRACTION = 0.95
-"""Minimum part of an object inside the frame of an image that shows it whole, as a fraction of the largest such part.
+"""Minimum fraction of an object inside the frame of an image that shows it whole, relative to its largest value.
 """
 MAX_BEST_VIEWS = 3
 _RENDER_SIZE = 256
@@ -356,9 +363,9 @@ class SimilarityTransform:
 class Placement:
     """Position and size of an object in one coordinate system."""
 
-    centroid: Float64[np.ndarray, " 3"]
+    centroid: Float64[Tensor, " 3"]
     """Mean of the Gaussian centers, weighted by W_j, the total weight of Gaussian j over all views."""
-    extent: Float64[np.ndarray, " 3"]
+    extent: Float64[Tensor, " 3"]
     """Distance from the 1st to the 99th percentile of the centers along x, y and z."""
     box: OrientedBox
 
@@ -377,7 +384,8 @@ class CatalogueObject:
     views: int
     """Number of training images that show the object."""
     best_views: tuple[str, ...]
-    """Names of up to three images. Images of the whole object come first, then those in which it covers most pixels."""
+    """Names of up to three images. Images of the whole object come first; among these, and among the others, larger
+    objects come first."""
     capture: Placement
     """Position and size in the coordinates of the capture."""
     scene: Placement
@@ -393,6 +401,8 @@ class Catalogue:
     """Number of selected Gaussians in components that are too small to be listed."""
     meters_per_unit: float | None
     """Meters per unit of the capture; None if unknown. If known, `capture` positions are in meters."""
+    view_shares: Float[Tensor, "m v"]
+    """Fraction of each of V training images that each of M objects covers, on the CPU; see `view_shares`."""
 
     @property
     def unit(self) -> str:
@@ -444,13 +454,13 @@ def make_catalogue(
     means, ids = scene.gaussians.means.double().cpu().numpy(), instances.instance_id.cpu().numpy()
     weight, reliability = (x.double().cpu().numpy() for x in (field.scalars.weight + 1e-12, field.scalars.reliability))
     count, names, cameras = len(instances.classes), scene.train.names, scene.train.cameras
-    shares = view_shares(scene, instances, RasterSettings.recorded(field.manifest), device).cpu().numpy()
+    shares = view_shares(scene, instances, RasterSettings.recorded(field.manifest), device).cpu()
     objects = []
     for number in range(1, count + 1):
         rows = np.flatnonzero(ids == number)
         if len(rows) == 0:
             continue
-        share = shares[number - 1]
+        share = shares[number - 1].numpy()
         shows = (share > 0) & (share >= MIN_VIEW_SHARE * share.max(initial=0))
         inside = _inside(means[rows], cameras)
         whole = shows & (inside >= MIN_WHOLE_FRACTION * inside[shows].max(initial=0))
@@ -472,11 +482,11 @@ def make_catalogue(
             )
         )
     small = int(((instances.class_id > 0) & (instances.instance_id == 0)).sum())
-    return Catalogue(tuple(objects), small, meters_per_unit)
+    return Catalogue(tuple(objects), small, meters_per_unit, shares)
 
 
 def view_shares(scene: Scene, instances: Instances, settings: RasterSettings, device: str) -> Float[Tensor, "m v"]:
-    """Return the fraction of each of V images that each of M objects covers, with occlusion.
+    """Return the fraction of each of V images that each of M objects covers, in 0..1, with occlusion.
 
     The fraction is the compositing weight of the object's Gaussians, averaged over the pixels of the image.
     """
@@ -508,7 +518,8 @@ def _inside(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 def _place(points: np.ndarray, weight: np.ndarray, box: OrientedBox | None = None) -> Placement:
     low, high = np.quantile(points, BOX_QUANTILES, axis=0)
-    return Placement(np.average(points, axis=0, weights=weight), high - low, box or oriented_box(points))
+    centroid = np.average(points, axis=0, weights=weight)
+    return Placement(torch.from_numpy(centroid), torch.from_numpy(high - low), box or oriented_box(points))
 
 
 _FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -545,9 +556,7 @@ def write_catalogue(
 
 
 def _plain(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    return {
-        key: x.tolist() if isinstance(x, np.ndarray) else list(x) if isinstance(x, tuple) else x for key, x in items
-    }
+    return {key: x.tolist() if isinstance(x, Tensor) else list(x) if isinstance(x, tuple) else x for key, x in items}
 
 
 def csv_columns() -> list[str]:
@@ -575,13 +584,13 @@ def csv_rows(catalog: Catalogue) -> Iterator[list[Any]]:
     for item in catalog.objects:
         best = [*item.best_views, *[""] * (MAX_BEST_VIEWS - len(item.best_views))]
         places = [(x.centroid, x.extent, x.box.center, x.box.size, *x.box.axes) for x in (item.capture, item.scene)]
-        numbers = np.array(places).ravel().tolist()
+        numbers = [number for place in places for vector in place for number in vector.tolist()]
         names = [csv_text(item.text), *map(csv_text, best)]
         yield [item.id, names[0], item.class_id, item.gaussians, item.reliability, item.views, *names[1:], *numbers]
 
 
 def csv_text(text: str) -> str:
-    """Escape a text for a CSV cell, so that spreadsheets do not interpret it as a formula.
+    """Escape a text for a CSV cell, so that spreadsheet programs do not interpret it as a formula.
 
     >>> csv_text("=1+1"), csv_text("red mug")
     ("'=1+1", 'red mug')
@@ -597,7 +606,7 @@ def write_box_mesh(path: Path, objects: Sequence[CatalogueObject], boxes: Iterab
     dtype += [("class_id", "<u4"), ("instance_id", "<u4")]
     corners = np.zeros(8 * len(objects), dtype)
     for item, box, block in zip(objects, boxes, corners.reshape(len(objects), 8)):
-        block["x"], block["y"], block["z"] = box.corners.T
+        block["x"], block["y"], block["z"] = box.corners.T.numpy()
         block["red"], block["green"], block["blue"] = object_color(item.id)
         block["class_id"], block["instance_id"] = item.class_id, item.id
     faces = np.empty(6 * len(objects), [("vertex_indices", "<i4", (4,))])

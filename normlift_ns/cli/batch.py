@@ -100,7 +100,7 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
 
 
 def is_lifted(run: Path) -> bool:
-    """Return whether a lifted run with a valid manifest exists.
+    """Return True if a lifted run with a valid manifest exists.
 
     Raises:
         InputError: The path exists, but is not a lifted run or is a damaged one.
@@ -134,7 +134,7 @@ def _capture_key(command: NormLift) -> str:
 
 
 def _splat_options_of_0_2(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options of splats with the values that version 0.2 wrote into keys, so that its batches stay valid."""
+    """Return options of splats with the values that version 0.2 wrote into keys, so that batches of 0.2 stay valid."""
     new = {name: value for name, value in values.items() if name == "primitive" and value is not None}
     if values["world_transform"] is None:
         new["search"] = False
@@ -210,7 +210,7 @@ class Shard:
     count: int
 
     def contains(self, position: int) -> bool:
-        """Return whether a position in the list, from 0, belongs to this part. Parts do not overlap.
+        """Return True if a position in the list, from 0, belongs to this part. Parts do not overlap.
 
         >>> [position for position in range(7) if Shard(1, 3).contains(position)]
         [1, 4]
@@ -227,7 +227,7 @@ def make_shard(word: str, environment: Mapping[str, str]) -> Shard:
     In a Slurm array whose tasks have several ranks (RANK, WORLD_SIZE), each rank of each task has its own part.
 
     Args:
-        word: auto for the part in the environment, none for the whole list, or i/n for the i-th of n parts, i from 1.
+        word: auto for the part that the environment defines, none for the whole list, or i/n for the i-th of n parts.
         environment: Environment variables.
     Raises:
         InputError: The word is invalid, variables contradict each other, or a Slurm array has gaps.
@@ -259,8 +259,9 @@ def _slurm_shard(environment: Mapping[str, str]) -> Shard:
     index, remainder = divmod(task - first, step)
     if remainder != 0 or not 0 <= index < count:
         raise InputError(
-            f"{_TASK_ID} is {task}, but expected {count} tasks from {first} on, without gaps. Submit an array without "
-            "gaps, such as sbatch -a 0-7, or give --shard none to let workers claim captures in a shared folder."
+            f"{_TASK_ID} is {task}, but the array must have {count} tasks from {first} on, without gaps. Submit "
+            "an array without gaps, such as sbatch -a 0-7, or give --shard none to let workers claim captures in a "
+            "shared folder."
         )
     return Shard(index, count)
 
@@ -298,7 +299,7 @@ _STATE_NAMES: dict[OutcomeState, str] = {"done": "lifted", "skipped": "already l
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of one attempt at a capture."""
+    """Result of one attempt to lift a capture."""
 
     capture: str
     """Line of the list."""
@@ -351,7 +352,7 @@ def outcomes_table(captures: Sequence[Capture], outcomes: Mapping[str, Outcome])
     for capture in captures:
         outcome = outcomes.get(capture.key)
         if outcome is None:
-            table.add_row(plain_text(capture.name), "unknown", "", "its results were deleted")
+            table.add_row(plain_text(capture.name), "unknown", "", "the results were deleted")
         else:
             text = outcome.message if outcome.state == "failed" else outcome.run or ""
             table.add_row(plain_text(capture.name), outcome.state, f"{outcome.seconds:.1f}", plain_text(text))
@@ -406,9 +407,9 @@ def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], i
 def failure_reason(code: int, log: Path) -> str:
     """Return the reason why a process failed: the signal that killed it, or the last line of its output."""
     if code < 0:
-        return f"its process was killed by {describe_signal(-code)}; read its output in {log}"
+        return f"the process was killed by {describe_signal(-code)}; see its output in {log}"
     lines = map(str.strip, read_file(log, max_bytes=2**31).decode("utf8", "replace").split("\n"))
-    *_, last = (f"its process ended with exit code {code} and without output", *filter(None, lines))
+    *_, last = (f"the process ended with exit code {code} without output", *filter(None, lines))
     return last
 
 
@@ -460,7 +461,7 @@ def lift_captures(
 
 
 def _is_complete(capture: Capture, outcomes: dict[str, Outcome]) -> bool:
-    """Return whether a capture is lifted and its result is recorded."""
+    """Return True if a capture is lifted and its result is recorded."""
     outcome = outcomes.get(capture.key)
     if outcome is None or outcome.state == "failed":
         return False

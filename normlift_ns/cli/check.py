@@ -33,8 +33,8 @@ _Result = TypeVar("_Result")
 @dataclass
 class NormLiftCheck(NormLift):
     """Check a capture and this machine before a lift, with the options of ns-normlift. The command encodes a few images
-    to estimate the seconds of every stage, the memory and the disk space, but lifts nothing. The exit code is 1 if a
-    check finds an error."""
+    to estimate the seconds of every stage, the memory and the disk space, but does not lift the scene. The exit code is
+    1 if a check finds an error."""
 
     output_json: Path | None = None
     """JSON file for the findings and the plan, in addition to the printed table."""
@@ -58,7 +58,7 @@ class NormLiftCheck(NormLift):
             raise SystemExit(1)
 
     def _rows(self, start_time: float) -> tuple[list[Diagnostic], Plan | None]:
-        """Return all findings up to an error that prevents further checks, and the plan if there was no error."""
+        """Run the checks until an error prevents further ones; return the findings and, without errors, the plan."""
         rows: list[Diagnostic] = []
         if _try(rows, "options", lambda: (self.check_early(),)) is None:
             return rows, None
@@ -95,7 +95,7 @@ class NormLiftCheck(NormLift):
             return rows, None
         if len(missing) > 0:
             source = make_source(SourceOptions(encoder="color"), device)
-            stand_in = "without these weights, the plan is that of a lift with --encoder color"
+            stand_in = "without these weights, the plan describes a lift with --encoder color"
             advice = "add the time of the networks, or fetch the weights and check again"
             rows.append(Diagnostic("plan", "warning", stand_in, advice))
         plan = _try(rows, "plan", lambda: planning.plan_opened(opened, source, self.lift, device, self.num_devices))

@@ -179,7 +179,7 @@ def _open_log(path: Path) -> IO[str]:
         return path.open("a", encoding="utf8", errors="backslashreplace")
     except OSError as error:
         raise InputError(
-            f"{path}, given with --log-file, cannot be written ({error.strerror}); give another"
+            f"{path}, given with --log-file, cannot be written ({error.strerror}); give another file"
         ) from error
 
 
@@ -305,7 +305,7 @@ def command_start() -> float:
 
 
 def _process_age() -> float:
-    """Return the seconds since the start of this process, or 0 if the system does not tell."""
+    """Return the seconds since the start of this process, or 0 if the system does not report it."""
     with suppress(OSError, AttributeError, ValueError, IndexError):
         ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
         return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
@@ -501,7 +501,7 @@ def _sigterm_raises() -> Iterator[None]:
 def _plain_warnings() -> Iterator[None]:
     """Print each warning of this package as one line.
 
-    Deprecation warnings of other packages go to the log file only. Their other warnings stay unchanged.
+    Deprecation warnings of other packages go to the log file only. Other warnings of these packages stay unchanged.
     """
     with warnings.catch_warnings():
         default = warnings.showwarning

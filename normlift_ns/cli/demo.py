@@ -1,15 +1,14 @@
 """make demo: generate a small room, lift it, query it, and compare the answers with the ground truth.
 
 The demo searches for colors, then for an object with the small networks of `--regions edges --encoder imagenet`, and
-lists the objects of the room. It fetches the weights at the start, and skips both if that fails.
+lists the objects of the room. It fetches the weights of the networks at the start; if that fails, it searches for
+colors only.
 """
 
 from __future__ import annotations
 
 import json
 import shlex
-import subprocess
-import sys
 import warnings
 from dataclasses import dataclass
 from importlib import import_module
@@ -24,8 +23,8 @@ from normlift_ns.cli.common import CONSOLE, info, run_command_process
 from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.preflight import check_writable_folder
 from normlift_ns.cli.query import NormLiftQuery
-from normlift_ns.encoders.package_files import EDGES, IMAGENET
 from normlift_ns.encoders.package_index import fetch_package_file
+from normlift_ns.encoders.weights import EDGES, IMAGENET
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.io.atomic import atomic_file, write_text_file
 from normlift_ns.options import AskOptions, CheckedOptions, LiftOptions, SourceOptions
@@ -36,13 +35,10 @@ if TYPE_CHECKING:
 
 _PROMPTS = ("tomato red", "pumpkin", "banana yellow", "eggplant")
 REGION_COUNT = 700
-"""Number of superpixels per view, which is enough to separate a tomato from its green star."""
+"""Number of superpixels per view, which is enough to separate a tomato from its green leaves."""
 _THING, _THING_CLASS, _THING_VIEWS = "banana", "banana yellow", 8
 """Prompt for the networks, its class in the room, and a sufficient number of views."""
 _ASK = AskOptions(threshold="auto")
-_COMPILE = (
-    "import torch; from normlift_ns.rasterization.numba import compile_kernels; compile_kernels(torch.float32).join()"
-)
 
 
 @dataclass
@@ -52,7 +48,7 @@ class Demo(CheckedOptions):
 
     folder: Path = Path("demo")
     """Output folder. The demo replaces files of earlier demos."""
-    num_gaussians: int = 45_000
+    num_gaussians: int = 36_000
     """Number of Gaussians in the room, at least 2,000. Larger values give finer surfaces and take longer."""
     views: int = 24
     """Number of training views, at least 3. More views take longer."""
@@ -67,9 +63,7 @@ class Demo(CheckedOptions):
         CONSOLE.rule("Generating a room")
         for category in (FutureWarning, SyntaxWarning):  # from dependencies
             warnings.simplefilter("ignore", category)
-        # Meanwhile, another core compiles the kernels that are not cached.
-        compiling = subprocess.Popen([sys.executable, "-W", "ignore", "-c", _COMPILE], stderr=subprocess.DEVNULL)
-        import numpy as np  # noqa: PLC0415 (as all below, after the compilation has started)
+        import numpy as np  # noqa: PLC0415 (as all below, which --help does not need)
         from PIL import Image  # noqa: PLC0415
 
         from normlift_ns.core.metrics import class_scores, confusion  # noqa: PLC0415
@@ -83,7 +77,6 @@ class Demo(CheckedOptions):
             import_module("normlift_ns.method_configs.normlift")
         write_capture(room, self.folder / "room", views=self.views)
         config = write_splatfacto_run(room, (self.folder / "room").absolute(), (self.folder / "outputs").absolute())
-        compiling.wait()
 
         CONSOLE.rule("Lifting")
         flags = ("--encoder", "color", "--region-count", REGION_COUNT)
@@ -127,9 +120,9 @@ class Demo(CheckedOptions):
         """Lift the features of the networks, search for the object, and return the IoU with the ground truth."""
         CONSOLE.rule("Searching for an object")
         flags = ("--regions", "edges", "--encoder", "imagenet", "--max-views", _THING_VIEWS)
-        flags += ("--refine", "False", "--storage", "evidence")
+        flags += ("--refine", "False", "--recognition", "False", "--storage", "evidence")
         _show("ns-normlift", "--load-config", config, *flags)
-        lift = LiftOptions(max_views=_THING_VIEWS, refine=False, storage="evidence")
+        lift = LiftOptions(max_views=_THING_VIEWS, refine=False, recognition=False, storage="evidence")
         source = SourceOptions(regions="edges", encoder="imagenet")
         run = NormLift(
             config, source=source, lift=lift, timestamp="thing", overwrite=True, check_alignment=False
@@ -141,7 +134,7 @@ class Demo(CheckedOptions):
         found = run.ask(_THING).mask.numpy()
         iou = float((found & truth).sum() / (found | truth).sum())
         info(f"IoU of the Gaussians that match {_THING!r} with the ground truth: {iou:.3f}")
-        CONSOLE.rule("What is in here?")
+        CONSOLE.rule("Listing the objects")
         image = self.folder / "objects.png"
         _show("ns-normlift-query", "--load-config", run.config, "--inventory", "--image", image)
         NormLiftQuery(run.config, inventory=True, image=image, overwrite=True).main()

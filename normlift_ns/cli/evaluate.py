@@ -56,8 +56,8 @@ class NormLiftEval(CheckedOptions):
     of ideas of SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage: regions without
     reliable evidence, unused images that would help, and new camera poses, as renders and as a camera path."""
     compare: Literal["paper"] | None = None
-    """Published results to print next to yours. paper: the tables of the paper that --protocol scannet or lerf and the
-    studies ablation, signals and timing measure, also in the output file."""
+    """Published results to compare with yours, in print and in the output file. paper: results of the paper for
+    --protocol scannet and lerf, and for the studies ablation, signals and timing."""
     text_embeddings: Path | None = None
     """NPZ file with one vector per class name, used instead of the text encoder of the runs."""
     data: Path | None = None
@@ -133,7 +133,8 @@ class NormLiftEval(CheckedOptions):
                 )
         if self.compare == "paper" and self.protocol not in ("scannet", "lerf"):
             raise InputError(
-                f"--compare paper needs --protocol scannet or lerf, not {self.protocol}; give one, or leave it out"
+                f"--compare paper needs --protocol scannet or lerf, not {self.protocol}; give one of these, or leave "
+                "--compare out"
             )
         runs = len(self.load_config)
         if self.protocol == "none":

@@ -111,7 +111,7 @@ class NormLiftExport(options.CheckedOptions):
         """Return the job with the Gaussians to export and the answer to the prompts."""
         from normlift_ns import exports  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.analysis.objects import object_tables  # noqa: PLC0415
-        from normlift_ns.session.prompts import split_texts  # noqa: PLC0415
+        from normlift_ns.query.question import split_texts  # noqa: PLC0415
 
         prompts = split_texts("--text", self.text)
         answer = run.ask(*prompts, **self.ask.rules()) if len(prompts) > 0 else run.ask_stored()
@@ -188,7 +188,7 @@ class NormLiftExport(options.CheckedOptions):
             preflight.check_new_files(*arrays, overwrite=self.overwrite, flags="--arrays-dir")
 
     def _check_answer(self) -> None:
-        """Raise InputError if an output or an option needs prompts, and there are none."""
+        """Raise InputError if an output or an option needs prompts, but none are given or stored."""
         if len(self.text) == 0:
             preflight.refuse_unused(self.ask, vars(self.ask), "--text")
         stored = Path(os.path.abspath(self.load_config)).parent / FIELD_FOLDER / "queries.safetensors"

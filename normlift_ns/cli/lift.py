@@ -153,7 +153,7 @@ class NormLift(CheckedOptions):
         keep_freed_memory()
         common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
         from normlift_ns.api import run_lift  # noqa: PLC0415 (as above)
-        from normlift_ns.evidence_collection import FeatureExport  # noqa: PLC0415
+        from normlift_ns.encoders.langsplat import FeatureExport  # noqa: PLC0415
 
         import_time = time.perf_counter()
         message_times: list[float] = []
@@ -214,7 +214,7 @@ class NormLift(CheckedOptions):
             )
         default = SplatOptions()
         if self.load_config is None:
-            options, names, hint = self, ("data", "load_step"), "--load-config (a splat has --images instead)"
+            options, names, hint = self, ("data", "load_step"), "--load-config (for a splat, give --images)"
         else:
             options, names, hint = self.splat, tuple(vars(default)), "--load-ply and --load-gsplat"
         for name in names:
@@ -296,7 +296,7 @@ def print_plan(plan: Plan) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Let glibc reuse freed memory instead of returning it to the system at once.
+    """Let glibc reuse freed memory instead of immediately returning it to the system.
 
     Without this, a lift on the CPU spends a third of its time in page faults of large temporary arrays.
     """
@@ -342,7 +342,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     table.add_row("reliability R", describe_reliability(statistics["reliability_quantiles"]))
     if "refined_share" in statistics:
         unsupported = f"{statistics['unsupported_share']:.1%} have no reliable neighbor"
-        refined = f"{statistics['changed_share']:.1%} of the Gaussians changed their direction by more than 11 degrees"
+        refined = f"{statistics['changed_share']:.1%} of the directions changed by more than 11 degrees"
         table.add_row("refined", f"{refined}; {unsupported}")
     seconds = {**before, **run.seconds}
     seconds |= {"other": total - sum(seconds.values())}
@@ -357,7 +357,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     table.add_row("stored as", f"{sizes.pop(storage)}, {error}")
     table.add_row("", "instead of " + ", ".join(sizes.values()))
     table.add_row("run", common.plain_text(run.folder))
-    return Group(Text("Lifted", style="bold green"), table, Text("Search it with:"))
+    return Group(Text("Lifted", style="bold green"), table, Text("Search the run with:"))
 
 
 def next_command(config: Path, queries: tuple[str, ...]) -> str:
@@ -394,9 +394,9 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
         kind: Kind of regions, such as sam or superpixel.
 
     >>> describe_consensus(0.3, 0.4, "superpixel")
-    'regions overlap by chance (agreement 0.30, needs more than 0.40), so features stay unchanged'
+    'regions of different views overlap by chance (agreement 0.30, at most 0.40), so features stay unchanged'
     >>> describe_consensus(0.3, 0.4, "files").split("; ")[1]
-    'if they are rough masks of objects, try --consensus-min-agreement 0'
+    'if the regions are rough masks of objects, try --consensus-min-agreement 0'
     """
     from normlift_ns.core.consensus import AGREEMENT_RAMP  # noqa: PLC0415 (torch is loaded by now)
 
@@ -404,12 +404,12 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
         extent = "applied" if agreement >= least + AGREEMENT_RAMP else "applied in part"
         return f"agreement {agreement:.2f}, {extent}"
     unchanged = (
-        f"regions overlap by chance (agreement {agreement:.2f}, needs more than {least:.2f}), so features "
+        f"regions of different views overlap by chance (agreement {agreement:.2f}, at most {least:.2f}), so features "
         "stay unchanged"
     )
     if kind in ("superpixel", "grid", "patches"):
         return unchanged
-    return f"{unchanged}; if they are rough masks of objects, try --consensus-min-agreement 0"
+    return f"{unchanged}; if the regions are rough masks of objects, try --consensus-min-agreement 0"
 
 
 def entrypoint() -> None:

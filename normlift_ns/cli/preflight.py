@@ -139,7 +139,7 @@ def check_run_config(config: Path, data: Path | None, step: int | None = None, *
     if checkpoints.is_dir() and not any(checkpoints.glob(pattern)):
         files = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
         raise FileNotFoundError(
-            f"There is no checkpoint {pattern} in {checkpoints}, which contains {files}. Copy the checkpoint there."
+            f"The checkpoint {pattern} is not in {checkpoints}, which contains {files}. Copy it to this folder."
         )
 
 
@@ -186,7 +186,7 @@ def refuse_unused(options: Any, names: Iterable[str], needed: str) -> None:
     """Raise InputError if one of these options, which have no effect without `needed`, differs from its default."""
     for name in names:
         if getattr(options, name) != getattr(type(options), name):
-            raise InputError(f"{option_name(name)} has no effect without {needed}; add that, or leave the option out")
+            raise InputError(f"{option_name(name)} has no effect without {needed}; add that, or leave this option out")
 
 
 def check_unused_options(lift: LiftOptions) -> None:

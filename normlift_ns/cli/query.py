@@ -88,8 +88,8 @@ class NormLiftQuery(CheckedOptions):
     render_dir: Path | None = None
     """Folder for renders of the relevancy."""
     render_views: tuple[str, ...] = ()
-    """Names of training images, such as 0001 0042, from whose cameras to render. Without names, the command renders
-    from three evenly spaced images."""
+    """Names of the training images, such as 0001 0042, whose cameras render the scene. Without names, the command uses
+    three evenly spaced images."""
     explain: bool = False
     """List the images and regions that voted for the selection, and their agreement."""
     explain_dir: Path | None = None
@@ -105,9 +105,9 @@ class NormLiftQuery(CheckedOptions):
     objects: bool = False
     """List the objects in the selection, which are connected groups of at least 20 Gaussians. The column id is the
     instance_id in exports, and text is the prompt with the largest relevancy. centroid is the mean position, weighted
-    by evidence. box has the edge lengths of the oriented box, longest first, and extent the size along x, y and z. Both
-    span the 1st to 99th percentile. R is the mean reliability. views counts the training images that show at least a
-    tenth as much of the object as the best image. best views names three images that show the object whole and large.
+    by evidence. box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z.
+    Both span the 1st to 99th percentile. R is the mean reliability. views counts the training images that show at least
+    a tenth as much of the object as the best image. best views names three images that show the object whole and large.
     If there are more than 40 objects, the table counts them for each prompt and lists the 10 largest."""
     objects_dir: Path | None = None
     """Folder for the list of --objects in capture and scene coordinates, with the axes of the boxes. The files are
@@ -121,7 +121,7 @@ class NormLiftQuery(CheckedOptions):
     object is named after the matching word of the vocabulary, or else numbered, such as object 3."""
     vocabulary: Path | None = None
     """Text file with names of objects for --inventory, one per line. None: the words of the encoder, which are 1,000
-    classes for imagenet and the names of colors for color. Other encoders have no words."""
+    classes for imagenet and the names of colors for color. With other encoders, objects are only numbered."""
     image: Path | None = None
     """PNG file for --inventory, with the outlines and numbers of the objects in the training image that shows the most
     objects."""
@@ -195,16 +195,23 @@ class NormLiftQuery(CheckedOptions):
     @cached_property
     def _prompts(self) -> tuple[str, ...]:
         """Prompts of --text, split at commas."""
-        from normlift_ns.session.prompts import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
+        from normlift_ns.query.question import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
 
         return split_texts("--text", self.text)
 
     @cached_property
     def _run(self) -> StoredRun:
-        """Stored run with its scene, which most answers do not need."""
+        """Stored run with its scene. Most answers do not need the scene."""
         from normlift_ns.data.open_scene import open_stored_run  # noqa: PLC0415 (as above)
 
         return open_stored_run(self.load_config, self.data)
+
+    @property
+    def _votes(self) -> RecordedVotes:
+        """Evidence of the lift for each training image."""
+        from normlift_ns.analysis.explain import RecordedVotes  # noqa: PLC0415 (as above)
+
+        return RecordedVotes(self._run.scene, self._run.field, cache_folder(self._run.folder))
 
     def _answer_with_scene(self, question: Query) -> Answer:
         from normlift_ns.query.engine import run_query  # noqa: PLC0415 (as above)
@@ -232,10 +239,7 @@ class NormLiftQuery(CheckedOptions):
         """
         import torch  # noqa: PLC0415
 
-        from normlift_ns.analysis.explain import RecordedVotes  # noqa: PLC0415
-
-        run, refined = self._run, result.question.refined
-        votes = RecordedVotes(run.scene, run.field, cache_folder(run.folder))
+        votes, refined = self._votes, result.question.refined
         masks = torch.as_tensor(result.selected).T
         reasons = [votes.explain(mask, refined=refined) if bool(mask.any()) else None for mask in masks]
         for row, why in zip(rows, reasons):
@@ -305,25 +309,32 @@ class NormLiftQuery(CheckedOptions):
 
     @property
     def _table_coordinates(self) -> Literal["scene", "capture"]:
-        """Coordinate system of the table of objects; meters are those of the capture."""
+        """Coordinate system of the table of objects; a table in meters uses that of the capture."""
         return self.coordinates if self.meters_per_unit is None else "capture"
 
     def _list_inventory(self) -> list[dict[str, Any]]:
         """Find the objects of the scene, write files, print the table and return its rows."""
-        from normlift_ns.analysis.objects import write_catalogue  # noqa: PLC0415 (as above)
-        from normlift_ns.lifted_run import open_run  # noqa: PLC0415
+        from normlift_ns.analysis import inventory, objects  # noqa: PLC0415 (as above)
+        from normlift_ns.core.device import choose_device  # noqa: PLC0415
+        from normlift_ns.query.text_encoder import encoder_name, own_words  # noqa: PLC0415
         from normlift_ns.rendering.figures import save_inventory  # noqa: PLC0415
 
         words = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
-        run = open_run(self.load_config, data=self.data, device=self.device, **self.ask.encoding())
-        found = run.inventory(words, meters_per_unit=self.meters_per_unit)
+        run = self._open()
+        encode = lambda texts: run.text_encoder.rows(texts)  # noqa: E731, PLW0108 (loads the encoder only if needed)
+        known = inventory.Vocabulary.of(own_words(run) if words is None else words, encoder_name(run), encode, run.ask)
+        folder, scene, stored = self._run
+        transform, device = objects.similarity_to_capture(folder, scene.identity), choose_device(self.device)
+        found = inventory.list_inventory(
+            self._votes, known, transform, meters_per_unit=self.meters_per_unit, device=device
+        )
         document = found.catalog.to_json()
         if self.output_json is not None:
             write_text_file(self.output_json, json.dumps(document, indent=2) + "\n", overwrite=self.overwrite)
         if self.objects_dir is not None:
-            write_catalogue(found.catalog, self.objects_dir, overwrite=self.overwrite)
+            objects.write_catalogue(found.catalog, self.objects_dir, overwrite=self.overwrite)
         if self.image is not None:
-            save_inventory(run.scene, found, self.image, manifest=run.field.manifest, overwrite=self.overwrite)
+            save_inventory(scene, found, self.image, manifest=stored.manifest, overwrite=self.overwrite)
         print_catalog(found.catalog, self._table_coordinates)
         written = [path for path in (self.output_json, self.objects_dir, self.image) if path is not None]
         if len(written) > 0:
@@ -357,8 +368,8 @@ class NormLiftQuery(CheckedOptions):
         flags = [f"--{name}" for name in ("text", "stdin", "interactive", "inventory") if getattr(self, name)]
         if len(flags) == 0:
             raise InputError(
-                'there are no prompts; give one with --text, such as --text "orange", or enter prompts one after '
-                "another with --interactive"
+                'no prompt is given; give one with --text, such as --text "orange", or enter prompts one at a time '
+                "with --interactive"
             )
         if len(flags) > 1:
             raise InputError(f"{flags[0]} and {flags[1]} cannot be combined; leave one of them out")
@@ -409,8 +420,8 @@ def read_vocabulary(path: Path) -> list[str]:
     return words
 
 
-_HELP = """Type prompts, separated by commas; double quotes keep a comma: "salt, pepper".
-help: this text. exit, quit or Ctrl-D: end. To ask for one of these words, write it in double quotes."""
+_HELP = """Separate prompts by commas. Put a prompt that contains a comma in double quotes: "salt, pepper".
+help: print this text. exit, quit or Ctrl-D: end. To search for one of these words, write it in double quotes."""
 
 
 def run_repl(
@@ -431,7 +442,7 @@ def run_repl(
     from prompt_toolkit import PromptSession  # noqa: PLC0415 (only needed here)
     from prompt_toolkit.history import FileHistory, InMemoryHistory  # noqa: PLC0415
 
-    from normlift_ns.session.prompts import split_prompts  # noqa: PLC0415
+    from normlift_ns.query.question import split_prompts  # noqa: PLC0415
 
     file = _history_file() if keep_history else None
     session = PromptSession(history=InMemoryHistory() if file is None else FileHistory(str(file)))
@@ -503,7 +514,7 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         sys.stdout.write(json.dumps(output) + "\n")
         sys.stdout.flush()
     if failed > 0:
-        raise InputError(f"{failed} of {total} prompts have no answer; their JSON lines have the reasons under `error`")
+        raise InputError(f"{failed} of {total} prompts have no answer; their JSON lines give the reasons under `error`")
 
 
 def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: bool) -> None:
@@ -582,11 +593,11 @@ def answer_table(
 _MAX_ROWS = 40
 """Maximum number of objects in a table of all objects."""
 _LARGEST = 10
-"""Number of objects in the table if there are more."""
+"""Number of objects in the table if there are more than `_MAX_ROWS`."""
 
 
 def print_catalog(catalog: Catalogue, coordinates: Literal["scene", "capture"] = "scene") -> None:
-    """Print a table of the objects. Of more than 40, count those of each prompt and print the 10 largest."""
+    """Print a table of the objects; if there are more than 40, print the 10 largest and the counts of each prompt."""
     count = len(catalog.objects)
     largest = sorted(catalog.objects, key=lambda item: -item.gaussians)[: count if count <= _MAX_ROWS else _LARGEST]
     common.CONSOLE.print(_catalog_table(catalog, sorted(largest, key=lambda item: item.id), coordinates))

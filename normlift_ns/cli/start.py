@@ -19,7 +19,7 @@ def _start(module: str, command: str) -> None:
 
 
 def _serve(module: str, command: str) -> None:
-    # threads of OpenMP that wait actively would take the time of other requests
+    # OpenMP threads that wait actively would take CPU time from other requests
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     _start(module, command)
 

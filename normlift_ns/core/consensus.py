@@ -19,8 +19,8 @@ The factor c_ts limits the influence of a region t that covers several objects. 
 cells of an arbitrary partition, for which the consensus would only average neighboring cells. For example, a square of
 a grid and its best match in a randomly shifted grid share 9/16 of their area on average. This corresponds to J = 0.39.
 
-Directions come from the lift of F', but R comes from the lift of F (see `with_original_reliability`). This R measures
-how much the regions disagreed before the consensus. It predicts the accuracy of F' better than the R of F' does.
+Directions come from the lift of F', but R comes from the lift of F (see `with_original_reliability`). The R of F
+measures the agreement of the regions before the consensus, and predicts the accuracy of F' better than the R of F'.
 """
 
 from __future__ import annotations

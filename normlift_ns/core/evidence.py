@@ -205,10 +205,10 @@ class Evidence(TensorRecord):
     def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
         """Return the evidence of coarser regions without rasterizing again.
 
-        E'_jt is the sum of E_js over all levels and over the columns s that are merged into t. From the cells of a
-        partition, this gives the evidence of any regions that consist of whole cells. The result is exact up to
-        rounding, because sums of A_ij ** weight_power are additive for any power. Columns that map to -1 are added to
-        the unlabeled weight of their view.
+        E'_jt is the sum of E_js over all levels and over the columns s that are merged into t. If the old columns are
+        the cells of a partition, the new columns may be any regions that consist of whole cells. The result is exact up
+        to rounding, because sums of A_ij ** weight_power are additive for any power. Columns that map to -1 are added
+        to the unlabeled weight of their view.
 
         With several levels, W_jv and the unlabeled weight count every pixel once per level. N_eff and R do not depend
         on the scale of W.
@@ -252,7 +252,8 @@ class Evidence(TensorRecord):
         The feature tables must be concatenated in the same order.
 
         Raises:
-            ValueError: if there are no parts, or they differ in the number of Gaussians or in the weight power.
+            ValueError: if no part is given, or if the parts differ in the weight power or in the number of Gaussians or
+                excluded Gaussians.
         """
         if not parts:
             raise InputError("Evidence.merge needs at least one part, got none")
@@ -318,7 +319,7 @@ class Evidence(TensorRecord):
 
 
 def check_not_negative(name: str, values: Tensor) -> None:
-    """Raise ValueError if a value is negative or not finite. The message counts such values and shows the first.
+    """Raise ValueError with the number of invalid values and an example if a value is negative or not finite.
 
     >>> check_not_negative("reliability", torch.tensor([0.0, 1.0]))
     """

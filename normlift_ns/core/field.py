@@ -57,7 +57,8 @@ class SemanticField(TensorRecord):
 
     scalars: Scalars
     source: Int32[Tensor, " n"]
-    """Gaussian whose direction Gaussian i takes in the refinement; source[i] = i if i keeps its own."""
+    """Index of the Gaussian whose direction Gaussian i takes in the refinement; source[i] = i if i keeps its own
+    direction."""
     store: StoredEvidence | StoredDirections
     manifest: Mapping[str, Any] = field(default_factory=dict)
     """JSON-ready metadata: storage (key `form`), sizes and bounds of all storage forms (key `forms`), fingerprint of
@@ -65,7 +66,8 @@ class SemanticField(TensorRecord):
     means: Float[Tensor, "n 3"] | None = None
     """Centers of the Gaussians at the time of the lift, float32; None in fields of version 0.1."""
     null_level: Float[Tensor, " n"] | None = None
-    """Null level of every Gaussian's own direction (see `core.null_level`), or None without a null vocabulary."""
+    """Null level of every Gaussian's own direction (see `core.null_level`), or None if the encoder has no null
+    vocabulary."""
 
     def __len__(self) -> int:
         return self.source.numel()
@@ -150,7 +152,7 @@ class SemanticField(TensorRecord):
     def query(
         self, text_vectors: Float[Tensor, "q d"] | Float[np.ndarray, "q d"], *, refined: bool = True
     ) -> Float[Tensor, "n q"]:
-        """Return the cosine between every Gaussian's direction and each of Q vectors of any length > 0.
+        """Return the cosine between every Gaussian's direction and each of Q vectors of any norm > 0.
 
         The cosine is 0 for Gaussians without a direction.
 
@@ -174,7 +176,7 @@ class SemanticField(TensorRecord):
 
     @check_arguments
     def null_levels(self, *, refined: bool = True) -> Float[Tensor, "n levels"]:
-        """Return the null level of every Gaussian as one column; no columns if there is no null vocabulary."""
+        """Return the null level of every Gaussian as a matrix [N, 1], or a matrix [N, 0] without a null vocabulary."""
         if self.null_level is None:
             return self.scalars.norm.new_zeros(len(self), 0)
         return (self.null_level[self.source.long()] if refined else self.null_level)[:, None]
@@ -235,7 +237,7 @@ class SemanticField(TensorRecord):
         _check_target(folder, {**self.manifest, "digests": dict(beside)})
         if (folder / MANIFEST_FILE).exists() and not overwrite:
             raise FileExistsError(
-                f"{folder} already holds a semantic field; choose another folder or pass overwrite=True"
+                f"{folder} already contains a semantic field; choose another folder or pass overwrite=True"
             )
         if not own:
             files = [folder / name for name in (FIELD_FILE, EVIDENCE_FILE, MANIFEST_FILE)]
@@ -297,7 +299,8 @@ def choose_form(
     Args:
         portion: part of the Gaussians that the lift covers (default: all).
     Returns:
-        Metadata of the chosen form and of all forms for the manifest, and the basis if the form is "low_rank".
+        Metadata of the chosen form and of the compared forms for the manifest, and the basis if the form is "low_rank",
+        which is compared only if it could be chosen.
     Raises:
         ValueError: if the storage is unknown, the tolerance is not positive, or no rank meets it for "low_rank".
     """
@@ -305,7 +308,8 @@ def choose_form(
         raise InputError(f"tolerance must be positive, got {tolerance}")
     if storage not in (*get_args(Storage), "auto"):
         raise InputError(f"storage must be one of auto, {', '.join(get_args(Storage))}, got {storage!r}")
-    basis = smallest_basis(lifted, tolerance, None if portion is None else portion.communicator)
+    communicator = None if portion is None else portion.communicator
+    basis = smallest_basis(lifted, tolerance, communicator) if storage in ("auto", "low_rank") else None
     forms = sizes_and_bounds(lifted, basis, portion)
     if storage == "auto":
         allowed = (name for name, form in forms.items() if form["bound"] <= tolerance)

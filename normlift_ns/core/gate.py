@@ -1,9 +1,9 @@
-"""Gate of the vote in the units of the features, measured on neighbors that share their regions.
+"""Gate of the vote, measured on neighbors that share their regions.
 
-A gate decides from a cosine whether two directions belong to the same object. Texts of one scene have cosines of .73 to
-.95 in CLIP and near 0 in a classifier, so no fixed cosine suits both. After a consensus, directions of one object agree
-closely, and this agreement can be measured in the lift. Let `same` be the cosines of lifted directions of neighbors
-that share a region in at least half of the views that see both::
+A gate decides from a cosine whether two directions belong to the same object. Texts of one scene have cosines of 0.73
+to 0.95 in CLIP and near 0 in a classifier, so no fixed cosine suits both. After a consensus, directions of one object
+agree closely, and this agreement can be measured in the lift. Let `same` be the cosines of lifted directions of
+neighbors that share a region in at least half of the views that show both::
 
     tau   = 5 % quantile of same
     gamma = (1 - tau) / 2
@@ -20,13 +20,13 @@ from normlift_ns.core.lift import Lifted
 from normlift_ns.core.sparse import SparseRows, sum_equal_keys
 
 GATE_QUANTILE = 0.05
-"""Share of neighbors of one thing that the gate rates below one half."""
+"""Fraction of the measured pairs of neighbors with a cosine below tau, for which the gate is less than one half."""
 SHARED_VIEWS = 0.5
-"""Smallest share of the views that see both Gaussians in which they must lie in one region."""
+"""Minimum fraction of views with a shared region, among the views that show both Gaussians."""
 MAX_TAU = 0.9985
 """Largest tau. A sharper gate would depend on rounding."""
 _PAIRS = 20_000
-"""Approximate number of pairs to measure. The quantile of so many has a standard error of 0.2 % of all pairs."""
+"""Approximate number of pairs to measure. The rank of their quantile has a standard error of 0.2 % of the pairs."""
 _LEAST_PAIRS = 50
 
 
@@ -51,7 +51,7 @@ def sample_pairs(
 def shared_region_cosines(
     lifted: Lifted, first: Int64[Tensor, " p"], second: Int64[Tensor, " p"], level: Int64[Tensor, " s"] | None = None
 ) -> Float64[Tensor, " q"]:
-    """Return <u_i, u_k> of the pairs that share a region in at least half of the views that see both.
+    """Return <u_i, u_k> of the pairs that share a region in at least half of the views that show both.
 
     Args:
         first, second: rows of the two Gaussians of every pair.

@@ -1,16 +1,16 @@
-"""Reliabilities that count pairs of views, and views by how much they differ in direction.
+"""Reliabilities from the agreement of pairs of views, optionally weighted by the angles between views.
 
-Features of one Gaussian in two views differ more if the angle between the views is larger. Nearby views therefore
-repeat the same errors. Let theta_vw be the angle between the directions from Gaussian j to the cameras of views v and
-w::
+Features of one Gaussian in two views differ more if the angle between the views is larger. Views from nearby cameras
+therefore tend to have the same errors. Let theta_vw be the angle between the directions from Gaussian j to the cameras
+of views v and w::
 
     s_vw = exp(-theta_vw / 21.7 degrees)
     N_j  = N_eff                                              pairs
     N_j  = W_j ** 2 / sum_vw W_jv W_jw s_vw                   angular; it equals N_eff if s_vw = 0 for v != w
     R_j  = (max(0, N_j ||f_j|| ** 2 - 1) + beta r) / (N_j - 1 + beta),   r = 0.02
 
-For N views of equal weight with unit features, (N ||f|| ** 2 - 1) / (N - 1) is their mean cosine over pairs of views.
-A Gaussian in a single view has no pair of views, so R = r.
+For N views of equal weight with unit features, (N ||f|| ** 2 - 1) / (N - 1) is the mean cosine of these features over
+pairs of views. For a Gaussian in a single view, there are no pairs, so R = r.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from torch import Tensor
 from normlift_ns.core.sparse import SparseRows
 
 DRIFT = 21.7
-"""Angle in degrees over which the correlation of features of one part falls to 1/e, measured on photographs."""
+"""Angle in degrees at which the correlation between features of the same object part falls to 1/e, measured on
+photographs."""
 LEAST_RELIABILITY = 0.02
 """R of a Gaussian without any pair of agreeing views. It is positive, because R = 0 means no evidence."""
 _CHUNK_ELEMENTS = 2**22

@@ -1,8 +1,8 @@
-"""Quality of a lift without labels, measured by its recognition of regions in views that were left out.
+"""Quality of a lift, measured without labels by the recognition of regions in views that were left out.
 
 Half of the views are left out, the others are lifted, and the left-out regions are compared with the lift. Then the
-halves are swapped. Let u_j be the directions of the Gaussians from the kept views, after a consensus among these views
-if it is enabled, and s a region of a left-out view::
+halves are swapped. Let s be a region of a left-out view, and u_j the directions of the Gaussians from the kept views.
+If the consensus is enabled, these directions follow a consensus among the kept views::
 
     U_s        = normalize(sum_j E_js u_j)                      feature of the region in the kept views
     recognized = U_s is nearer to F_s than to all other regions of its view
@@ -10,7 +10,7 @@ if it is enabled, and s a region of a left-out view::
     agreement  = mean of <U_s, F'_s> over all regions, F'_s after a consensus among the left-out views alone
 
 Only confirmed regions are evaluated. A region without a similar region in other views, such as a wrong or merged mask,
-should not be recognized. The figures do not include the vote, and do not predict whether it helps.
+should not be recognized. These measures do not include the vote, and do not predict whether the vote helps.
 """
 
 from __future__ import annotations
@@ -29,18 +29,19 @@ from normlift_ns.core.lift import lift
 from normlift_ns.core.sparse import CHUNK_ELEMENTS, SparseRows, row_offsets
 
 PARTNER_IOU = 0.3
-"""Smallest J of a kept region that confirms a left-out one."""
+"""J above which a kept region confirms a left-out region."""
 
 
 class LeftOut(NamedTuple):
-    """Recognition of left-out views by the lift of the others."""
+    """Recognition of left-out views by the lift of the other views."""
 
     recognized: int
     """Number of confirmed regions that the lift recognizes."""
     confirmed: int
     """Number of left-out regions that overlapping kept regions confirm."""
     agreement: float
-    """Mean cosine of left-out regions, after a consensus among themselves, with the lift; NaN without regions."""
+    """Mean cosine between the lift and the left-out regions, after a consensus among these regions; NaN without
+    regions."""
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -65,7 +66,8 @@ def leave_views_out(
         probability: sampling probability of each row.
         features: F, before the consensus; unit rows or 0.
         level: level of every region (default: the same for all). Regions of different levels are not compared.
-        power, least: options of the consensus of the kept views. If `least` is None, there is no consensus.
+        power, least: options of the consensus, as in `consensus`. If `least` is None, lift the kept views without a
+            consensus.
     """
     device = sampled.rows.weight.device
     view, views = sampled.region_view.long(), sampled.num_views
@@ -140,7 +142,7 @@ def _partners(found: Overlaps, kept: Bool[Tensor, " s"], features: Float[Tensor,
 def _nearest_is_own(
     rows: Float[Tensor, "c d"], features: Float[Tensor, "c d"], group: Int64[Tensor, " c"]
 ) -> Bool[Tensor, " c"]:
-    """Return whether each row, if it is not 0, is nearer to its own feature than to the others of its group."""
+    """Return True for each nonzero row that is nearer to its own feature than to the other features of its group."""
     found = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     for one in group.unique().tolist():
         members = (group == one).nonzero().squeeze(1)

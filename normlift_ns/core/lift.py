@@ -278,7 +278,8 @@ def check_unit_rows(
         advice: suggestion for the user in the message.
         allow_zeros: accept rows of zeros too.
     Raises:
-        ValueError: if a row has the wrong length or is not finite. The message counts such rows and shows three.
+        ValueError: if a row has the wrong length or is not finite. The message gives the number of these rows and up to
+            three examples.
 
     >>> check_unit_rows(torch.tensor([[0.6, 0.8]]), "feature rows", "normalize them").round(decimals=6)
     tensor([1.], dtype=torch.float64)

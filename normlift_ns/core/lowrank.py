@@ -46,7 +46,7 @@ class SpectralTable(NamedTuple):
 
 
 def spectral_table(features: Float[Tensor, "s d"], team: Communicator | None = None) -> SpectralTable:
-    """Compute the eigenvectors of the feature table in float64. All processes use those of process 0."""
+    """Compute the eigenvectors of the feature table in float64. All processes use the result of process 0."""
     exact = features.double()
     vectors = torch.linalg.eigh(exact.T @ exact).eigenvectors.flip(1)
     vectors = vectors if team is None else team.broadcast(vectors)
@@ -185,7 +185,7 @@ def encode_directions(
 def arrange_directions(
     parts: Sequence[Float16[Tensor, "_ r"]], gaussians: Sequence[Int64[Tensor, " _"]], basis: Tensor | None, n: int
 ) -> StoredDirections:
-    """Join parts of the directions of n Gaussians in index order; `gaussians` has the indices of each part's rows."""
+    """Join parts of the directions of n Gaussians in index order; `gaussians` lists the indices of each part's rows."""
     row_of = torch.zeros(n + 1, dtype=torch.int64, device=parts[0].device)
     for index in gaussians:
         row_of[index + 1] = 1

@@ -13,7 +13,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import WithoutDirection
 
 NO_CLASS = -1
-"""True class of points to ignore, and predicted class of Gaussians without a direction."""
+"""Ground-truth class of points to ignore, and predicted class of Gaussians without a direction."""
 
 
 class ClassScores(NamedTuple):
@@ -123,7 +123,7 @@ class Correlation(NamedTuple):
 
 
 def spearman_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
-    """Compute Spearman's rank correlation. Ties have their mean rank."""
+    """Compute Spearman's rank correlation. Tied values get their mean rank."""
     return _correlation("spearmanr", a, b)
 
 

@@ -62,9 +62,9 @@ def nearest_neighbors(
     """Find the exact K nearest neighbors in 3D, N_K(i) of the paper, excluding self.
 
     The CPU uses a k-d tree of the distinct positions, because any number of Gaussians may share a position. The GPU
-    uses `kernels.nearest`, which certifies every row of its result. It cannot certify a row with more ties than
-    candidates. For such a row, the GPU computes all distances. If there are many, the CPU repeats the search. A
-    Gaussian whose mean is not finite has no neighbors and is not a neighbor of others.
+    uses `kernels.nearest`, which certifies the rows of its result. It cannot certify rows with more ties than
+    candidates. For these rows, the GPU computes all distances. If there are too many of them, the CPU repeats the
+    search. A Gaussian whose mean is not finite has no neighbors and is not a neighbor of others.
 
     Args:
         of: Gaussians to find neighbors for, one per row of the result (default: all n).

@@ -24,6 +24,8 @@ _CHUNK_ELEMENTS = (2**22, 2**24)
 """Number of elements of the largest tensor of a vote in torch, on CPU and GPU. The CPU limit suits its caches."""
 _BLOCK = (2 * PARTITION_BLOCK, 16 * PARTITION_BLOCK)
 """Number of Gaussians per block, on CPU and GPU. Directions of one block and its neighbors are in memory at a time."""
+CHANGED_COSINE = 0.98
+"""Cosine of the directions before and after the vote below which a Gaussian counts as changed, about 11 degrees."""
 MAX_VOTERS = 256
 """Largest K of a vote. Time grows with the square of K, because a vote compares all pairs of neighbors."""
 _MAX_KERNEL_NEIGHBORS = 63
@@ -57,8 +59,8 @@ def refine(
     a mean in 0..1 that counts as much as P views. Neighbors therefore have less influence if i has more views.
 
     All votes use the unrefined directions. In a tie, the nearer neighbor wins. If no neighbor is reliable, i keeps its
-    direction (see `unsupported`). It also keeps it if less than `min_labeled` of its weight lies in regions. If R_i =
-    0, S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
+    direction (see `unsupported`). Gaussian i also keeps its direction if less than `min_labeled` of its weight lies in
+    regions. If R_i = 0, S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
 
     Args:
         config: options of the vote (default: the posterior vote with `own`, else the paper's vote).
@@ -279,7 +281,8 @@ def posterior_weights(
 ) -> Float64[Tensor, "m k_plus_1"]:
     """Return own_i and P R_k d_ik / sum_k R_k d_ik of every neighbor, or 0 if it is missing or none is reliable.
 
-    Squared distances are relative to that of the nearest reliable neighbor, which cancels and avoids underflow.
+    Squared distances are relative to that of the nearest reliable neighbor. This factor cancels, and it avoids
+    underflow.
     """
     r, square = _within(neighbors, width, rows, reliability)
     near = r[:, 1:] * _decay(r[:, 1:], square[:, 1:])

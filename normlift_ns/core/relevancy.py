@@ -23,11 +23,11 @@ TEMPERATURE = 10.0
 PROMPT_BLOCK = 32
 """Number of prompts that are compared with all Gaussians at a time, which bounds the memory of a query."""
 _SAMPLED = 16
-"""One of this number of values is in the sample of `_largest`."""
+"""Sampling step of `_largest`, which samples one of this number of values."""
 TOP_QUANTILE = 0.999
-"""Quantile over Gaussians that is the top relevancy of a prompt. Single outliers do not affect it."""
+"""Quantile over Gaussians that defines the top relevancy of a prompt. Single outliers do not affect it."""
 _LARGEST_COSINE = 1.01
-"""Largest cosine that counts as rounded; half precision exceeds 1 by about a thousandth."""
+"""Largest accepted cosine. In half precision, rounding errors of cosines are about a thousandth."""
 _PRESENT = 0.62
 """Relevancy by the rule "lerf" that objects in a scene usually reach."""
 
@@ -116,7 +116,7 @@ def relevancy(
             in -2..2.
         temperature: factor of the cosines inside the softmax, > 0.
     Raises:
-        ValueError: if a value is not in -1..1, or the rule is unknown, or needs negatives and there are none.
+        ValueError: if a value is not in -1..1, the rule is unknown, or the rule needs negatives and none are given.
 
     >>> import torch
     >>> from normlift_ns import relevancy
@@ -162,7 +162,7 @@ def gaussian_relevancy(
     """Compute the relevancy of Gaussians. Those without a direction (not `valid`) get the smallest value of the rule.
 
     Raises:
-        ValueError: if the rule is unknown, or needs negatives and there are none.
+        ValueError: if the rule is unknown, or if it needs negatives and none are given.
     """
     values = _relevancy(positive, negative, rule, TEMPERATURE)
     return _namespace(values).where(valid[:, None], values, RELEVANCY_RULES[rule].no_direction)

@@ -29,7 +29,7 @@ _MAX_SORTED = 2**27
 def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float64[Tensor, " rows"]:
     """Return the sums of the segments values[offsets[i]:offsets[i + 1]] in float64, or 0 for empty segments.
 
-    Each segment is summed separately, so a value of 1e-12 in one row survives 1e6 in another.
+    Each segment is summed separately, so a value of 1e-12 in one row is not lost next to a value of 1e6 in another.
 
     >>> segment_sum(torch.tensor([1.0, 2.0, 4.0]), torch.tensor([0, 2, 2, 3])).tolist()
     [3.0, 0.0, 4.0]

@@ -20,8 +20,8 @@ from normlift_ns.rasterization.settings import RasterSettings
 MIN_PSNR = 24.0
 """Usual minimum PSNR in dB. Real scenes reach 25 to 40 dB on their training images."""
 MIN_MARGIN = 3.0
-"""Minimum lead in dB over the PSNR of the images' mean color. Wrong worlds have less. Right worlds have at least 1 dB
-more than this minimum (`python -m research.worlds`)."""
+"""Minimum lead in dB over the PSNR of the images' mean color. Cameras in a wrong world have less. Cameras in the right
+world have at least 1 dB more than this minimum (`python -m research.worlds`)."""
 _MIN_VISIBLE = 0.001
 """Minimum fraction of the Gaussians in the view that contains most of them."""
 
@@ -57,7 +57,7 @@ def measure_alignment(
         scene: Gaussians, cameras and images.
         settings: constants of the rasterizer at the original image size. None: the constants that the scene records.
         device: torch device to render on.
-        explain: also look for the cause of a PSNR below the usual one.
+        explain: look for a better lens or primitive even if the PSNR or the margin is below the usual minimum.
     Raises:
         FileNotFoundError, ValueError: An image is missing or cannot be read.
     """
@@ -108,12 +108,12 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
         else "cameras of another capture; cameras in a world that --world-transform auto does not try (give a file "
         "with the transform; for gsplat's trainer see --gsplat-normalize); other images, or distorted images with "
         "cameras for undistorted ones; a different exposure from the training images; much smaller copies of the "
-        "training images; another --rasterize-mode or --background"
+        "training images; or another --rasterize-mode or --background"
     )
     if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(
-            f"The cameras do not show this splat: at most {match.visible_fraction:.2%} of its Gaussians are in any "
-            f"of three training views. {causes}. To lift anyway, give --check-alignment False."
+            "The cameras do not show this splat: each of three training views contains at most "
+            f"{match.visible_fraction:.2%} of its Gaussians. {causes}. To lift anyway, give --check-alignment False."
         )
     reason = match.cause or f"{causes}."
     if match.margin < MIN_MARGIN:
@@ -123,7 +123,7 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
             f"Expected at least {MIN_MARGIN:.0f} dB more. {reason}"
         )
         if not trained_cameras:
-            raise InputError(f"{problem} --check-alignment False lifts anyway.")
+            raise InputError(f"{problem} To lift anyway, give --check-alignment False.")
         return problem
     name, lowest = match.worst
     if match.cause is not None:

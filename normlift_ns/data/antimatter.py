@@ -22,10 +22,10 @@ def read_antimatter(path: Path) -> SplatFile:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: Its size is not a multiple of 32 bytes, or its Gaussians cannot be drawn.
+        ValueError: The file size is not a multiple of 32 bytes, or the Gaussians cannot be rendered.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no .splat file at {path}. Give the file of the splat with --load-ply.")
+        raise FileNotFoundError(f"The .splat file {path} does not exist. Give an existing file with --load-ply.")
     with open_regular(path) as file:
         data = file.read()
     if len(data) == 0 or len(data) % _ROW.itemsize != 0:

@@ -20,11 +20,11 @@ _PARALLEL = 1e-6
 
 
 def read_camera_file(options: SplatOptions, advice: str | None = None) -> CameraFile:
-    """Read the camera file in the options, and check that its images exist.
+    """Read the camera file that the options name, and check that its images exist.
 
     Args:
         options: Paths of cameras, images and masks.
-        advice: Advice on missing images, for error messages; None for advice that suits the options.
+        advice: Advice on missing images, for error messages; None for advice that depends on the options.
     Raises:
         FileNotFoundError: A file, folder, image or mask is missing.
         ValueError: The options do not contain exactly one camera file, or it cannot be read.
@@ -37,7 +37,7 @@ def read_camera_file(options: SplatOptions, advice: str | None = None) -> Camera
         )
     for name, folder in (("--images", options.images), ("--masks", options.masks)):
         if folder is not None and not folder.is_dir():
-            raise FileNotFoundError(f"There is no folder {folder}, given with {name}. Give an existing folder.")
+            raise FileNotFoundError(f"The folder {folder}, given with {name}, does not exist. Give an existing folder.")
     if advice is None:
         is_given = options.images is not None
         advice = "remove them from the camera file" if is_given else GIVE_IMAGES
@@ -70,7 +70,8 @@ def adjust_poses(
         hint = " The trainer holds out every 8th image: give --test-every 8." if len(deltas) == without_eighth else ""
         raise InputError(
             f"{path} has pose adjustments for {len(deltas)} training views (--pose_opt), but {len(trained)} of "
-            f"{len(frames)} images are training views. Give the other images with --test-every or --eval-images.{hint}"
+            f"{len(frames)} images are training views. Give the held-out images with --test-every or "
+            f"--eval-images.{hint}"
         )
     by_name = {}
     for frame, delta in zip(trained, deltas.numpy()):

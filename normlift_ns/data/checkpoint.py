@@ -272,7 +272,7 @@ def _check_archive(path: Path, advice: str) -> None:
 
 
 def _model_state(pipeline: dict[Any, Any], path: Path) -> dict[str, Tensor]:
-    """Return the tensors of the model by name, without the prefix `module.` of trainings on several GPUs."""
+    """Return the tensors of the model by name, without the prefix `module.` that training on several GPUs adds."""
     state: dict[str, Tensor] = {}
     for name, value in pipeline.items():
         if not isinstance(name, str):
@@ -323,7 +323,7 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
     Raises:
         FileNotFoundError: The file, or the file of another rank, does not exist.
         ValueError: A file is damaged, comes from another trainer or training run, or needs an appearance network, or
-            the Gaussians cannot be drawn.
+            the Gaussians cannot be rendered.
     """
     files = _rank_files(path)
     loaded = [_read_rank(file) for file in files]
@@ -407,8 +407,8 @@ def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
     if "app_module" in loaded:
         raise InputError(
             f"{path} contains an appearance network, `app_module` (--app_opt), which computes the colors of its "
-            "Gaussians. Train it again without --app_opt. Or export a PLY file with the trainer's --save_ply, and give "
-            "it with --load-ply."
+            "Gaussians. Train the scene again without --app_opt. Or export a PLY file with the trainer's --save_ply, "
+            "and give it with --load-ply."
         )
     missing = [name for name in _GSPLAT_NAMES if name not in splats]
     if missing or not all(isinstance(value, Tensor) for value in splats.values()):

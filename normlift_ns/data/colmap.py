@@ -63,8 +63,8 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
     """
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"There is no folder {folder}. Give the folder of the COLMAP project, which contains images/ and sparse/0, "
-            "with --colmap."
+            f"The folder {folder} does not exist. Give the folder of the COLMAP project, which contains images/ and "
+            "sparse/0, with --colmap."
         )
     if _is_model(folder):
         return folder
@@ -73,8 +73,8 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
     models = list(filter(_is_model, dict.fromkeys([*places, *(other for other in numbered if other.name.isdigit())])))
     if len(models) == 0:
         raise FileNotFoundError(
-            f"{folder} contains no COLMAP reconstruction: there is no cameras.bin or cameras.txt in it or in its "
-            f"{', '.join(_MODEL_FOLDERS)}. Give the folder that contains sparse/0 with --colmap."
+            f"{folder} contains no COLMAP reconstruction: cameras.bin and cameras.txt are missing from it and from "
+            f"its {', '.join(_MODEL_FOLDERS)}. Give the folder that contains sparse/0 with --colmap."
         )
     if len(models) == 1:
         return models[0]
@@ -176,10 +176,14 @@ def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera]
             )
     orphans = [image for image in images if image.camera_id not in cameras]
     if orphans or len(images) == 0:
-        problem = f"{orphans[0].name} lacks its camera {orphans[0].camera_id}" if orphans else "there is no image"
+        problem = (
+            f"{orphans[0].name} refers to the missing camera {orphans[0].camera_id}"
+            if orphans
+            else "no image is registered"
+        )
         raise InputError(
-            f"{model} has {len(cameras)} cameras and {len(images)} registered images: {problem}. Expected images that "
-            "each have a camera. Copy the whole reconstruction again."
+            f"{model} has {len(cameras)} cameras and {len(images)} registered images: {problem}. Expected one or more "
+            "images, each with its camera. Copy the whole reconstruction again."
         )
     if len({image.image_id for image in images}) < len(images):
         raise InputError(f"{model} has two images with the same ID. {_ADVICE}")
@@ -226,7 +230,7 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
         advice: Advice on missing images, for error messages.
     Raises:
         FileNotFoundError: The reconstruction, an image or a mask is missing.
-        ValueError: The errors of `read_colmap_model` and `colmap_intrinsics`.
+        ValueError: As in `read_colmap_model` and `colmap_intrinsics`.
     """
     remarks: list[str] = []
     model = find_colmap_model(folder, remarks.append)
@@ -236,7 +240,9 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
     intrinsics = {camera_id: colmap_intrinsics(camera, model) for camera_id, camera in cameras.items()}
     images_dir = (images or folder / "images").absolute()
     if not images_dir.is_dir():
-        raise FileNotFoundError(f"There is no image folder {images_dir}. Copy the images into it, or {advice}.")
+        raise FileNotFoundError(
+            f"The image folder {images_dir} does not exist. Copy the images to this path, or {advice}."
+        )
     names = [image.name for image in registered]
     files = find_images(names, images_dir, model, advice, allow_copies=True)
     mask_files = [None] * len(files) if masks is None else find_masks(names, masks)
@@ -280,7 +286,7 @@ def read_colmap_points(model: Path) -> Float[np.ndarray, "n 3"]:
     """Return the points of a reconstruction, sorted by their IDs.
 
     Raises:
-        FileNotFoundError: There is no points3D file.
+        FileNotFoundError: The points3D file is missing.
         ValueError: The file is damaged, or contains points that are not finite.
     """
     positions = dict(_read(model, "points3D", _points_text, _points_binary))

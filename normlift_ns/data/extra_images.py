@@ -33,8 +33,8 @@ def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None)
         cameras: Folder of a COLMAP project, or a transforms.json, with old and new images.
         images: Folder of the images; if None, the default of `SplatOptions.images`.
     Raises:
-        FileNotFoundError, ValueError: The errors of `open_splat`. Also, no image is new, fewer than two images are
-            known, or known cameras have moved relative to each other.
+        FileNotFoundError, ValueError: As in `open_splat`. Also if no image is new, fewer than two images are known, or
+            known cameras have moved relative to each other.
     """
     path = cameras.absolute()
     is_transforms = path.suffix == ".json" or (path / "transforms.json").is_file()
@@ -104,6 +104,6 @@ def _align(extended: CameraFile, known: dict[str, Camera]) -> WorldTransform:
             f"In {extended.source}, the camera of {old[worst].name} has moved since the training, by "
             f"{shifts[worst]:.2%} of the extent of the cameras and {angles[worst]:.2g} degrees. {len(old)} old images "
             "were compared. Register the new images without moving the old ones: in COLMAP, use image_registrator on "
-            "the old model, without bundle adjustment. A training that optimizes its cameras moves them too."
+            "the old model, without bundle adjustment. Training that optimizes the cameras moves them as well."
         )
     return WorldTransform(np.concatenate([rotation, translation[:, None] / scale], axis=1), scale)

@@ -19,9 +19,9 @@ MAX_ANGLE = math.radians(80)
 """Angle from the optical axis beyond which pixels are not kept. A pinhole camera cannot show directions near 90
 degrees."""
 _MIN_SHARE = 0.1
-"""Minimum share of pixels within `MAX_ANGLE`. With less, the distortion is wrong."""
+"""Minimum share of pixels within `MAX_ANGLE`. If the share is smaller, the distortion is wrong."""
 _SAMPLES, _SAMPLING_ERROR = 512, 1e-3
-"""Number of rows and of columns of pixels from which shares are estimated, and the error of this."""
+"""Number of rows and of columns of pixels from which shares are estimated, and the error of the estimates."""
 _ANGLES = np.linspace(0, math.radians(89.9), 8192)
 
 
@@ -59,11 +59,11 @@ def _pinhole(lens: Intrinsics) -> _Pinhole:
     is_seen = limits > 0
     if is_seen.mean() < _MIN_SHARE:
         raise InputError(
-            f"its fisheye lens (fx {lens.fx:g}, {lens.width} x {lens.height} pixels, k1 to k4 {[*lens[6:9], lens.k4]}) "
-            f"shows {is_seen.mean():.0%} of its pixels within {math.degrees(MAX_ANGLE):.0f} degrees of its axis. "
-            f"Expected at least {_MIN_SHARE:.0%}; a pinhole camera shows no others. Correct the focal length and the "
-            "distortion, or undistort the images to a smaller angle, for example with colmap image_undistorter, and "
-            "give the new images and cameras"
+            f"its fisheye lens (fx {lens.fx:g}, {lens.width} x {lens.height} pixels, k1 to k4 "
+            f"{[*lens[6:9], lens.k4]}) shows {is_seen.mean():.0%} of the pixels within {math.degrees(MAX_ANGLE):.0f} "
+            f"degrees of the optical axis. Expected at least {_MIN_SHARE:.0%}; a pinhole camera cannot show the other "
+            "pixels. Correct the focal length and the distortion, or undistort the images to a smaller angle, for "
+            "example with colmap image_undistorter, and give the new images and cameras"
         )
     lost = int((1 - KEPT_SHARE - _SAMPLING_ERROR) * len(limits))
     factor = np.partition(limits, lost)[lost] or limits[is_seen].min()
@@ -89,19 +89,19 @@ def _focal_limits(lens: Intrinsics) -> Float[np.ndarray, " n"]:
 
 
 def _bent(angles: Float[np.ndarray, " n"], lens: Intrinsics) -> Float[np.ndarray, " n"]:
-    """Return the distances from the principal point, in focal lengths, at which a fisheye lens shows angles."""
+    """Return the distances from the principal point, in focal lengths, at which a fisheye lens shows the angles."""
     square = angles**2
     return angles * (1 + square * (lens.k1 + square * (lens.k2 + square * (lens.k3 + square * lens.k4))))
 
 
 def _last_angle(lens: Intrinsics) -> float:
-    """Return the angle up to which larger angles are shown farther from the principal point."""
+    """Return the angle up to which the distance from the principal point increases with the angle."""
     turns = np.diff(_bent(_ANGLES, lens)) <= 0
     return float(_ANGLES[turns.argmax()] if turns.any() else _ANGLES[-1])
 
 
 class _Sources(NamedTuple):
-    """Positions in an original image of the pixels of the undistorted one, with pixel centers at integers."""
+    """Position in the original image of each pixel of the undistorted image, with pixel centers at integers."""
 
     x: Float32[np.ndarray, "h w"]
     y: Float32[np.ndarray, "h w"]
@@ -131,7 +131,7 @@ def filled_pixels(lens: Intrinsics) -> Bool[np.ndarray, "h w"]:
 
 
 def undistort_fisheye(image: UInt8[np.ndarray, "h w c"], lens: Intrinsics) -> UInt8[np.ndarray, "h w c"]:
-    """Undistort a fisheye image by linear interpolation. Pixels that it does not show become 0."""
+    """Undistort a fisheye image by linear interpolation. Pixels that the original image does not show become 0."""
     x, y, filled = _sources(lens)
     pixels = cv2.remap(image, x, y, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return pixels.reshape(*filled.shape, -1) * filled[:, :, None]

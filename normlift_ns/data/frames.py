@@ -80,8 +80,8 @@ def check_mask(mask: Path, file: Path, size: tuple[int, int]) -> None:
         file: Path of its image, for error messages.
         size: Width and height of the image in pixels.
     Raises:
-        FileNotFoundError, ValueError: The errors of `read_image_header`, or the mask has the wrong channels or
-            the wrong size. The message gives both paths.
+        FileNotFoundError, ValueError: As in `read_image_header`; also if the mask has the wrong channels or the wrong
+            size. The message gives both paths.
     """
     header = read_image_header(mask)
     if header.mode not in _SINGLE_CHANNEL and not header.mode.startswith("I;16"):
@@ -110,7 +110,11 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
             "are in CMYK, which training reads with wrong colors",
             "Convert them to RGB",
         ),
-        ([header.multi_frame for header in headers], "contain several images", "Only the first of each is used"),
+        (
+            [header.multi_frame for header in headers],
+            "contain several images",
+            "Only the first image of each file is used",
+        ),
     )
     warnings = []
     for affected, problem, advice in kinds:
@@ -130,7 +134,8 @@ PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """Fisheye camera models that `Intrinsics` can represent, by their names in COLMAP."""
 _SMALLEST = 1e-12
-"""Distortion that moves no pixel. nerfstudio treats fisheye cameras without distortion as pinhole cameras."""
+"""Distortion that is too small to move any pixel. nerfstudio treats fisheye cameras without distortion as pinhole
+cameras."""
 
 
 class Intrinsics(NamedTuple):
@@ -204,8 +209,8 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
     """Raise if the cameras of a camera file are not valid.
 
     Raises:
-        ValueError: There are no cameras, a name occurs twice, or a pose is not rigid. A number is not finite, or a
-            focal length or size is not positive. Some cameras are fisheye cameras, and others are not.
+        ValueError: There are no cameras, a name occurs twice, a pose is not rigid, a number is not finite, or a focal
+            length or size is not positive. Also if only some of the cameras are fisheye cameras.
     """
     if len(frames) == 0:
         raise InputError(f"{source} has no cameras with images. Expected a camera for every training image.")

@@ -116,10 +116,11 @@ def read_gltf(path: Path) -> SplatFile:
     Raises:
         FileNotFoundError: The file, or the file of a buffer, does not exist.
         ValueError: The file is damaged or not a glTF file with exactly one splat. It needs an unsupported extension or
-            setting, places the splat several times or with more than one scale, or has Gaussians that cannot be drawn.
+            setting, places the splat several times or with more than one scale, or has Gaussians that cannot be
+            rendered.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no glTF file at {path}. Give the file of the splat with --load-ply.")
+        raise FileNotFoundError(f"The glTF file {path} does not exist. Give an existing file with --load-ply.")
     gltf = _open_gltf(path)
     index, primitive = _find_splat(gltf)
     extension = primitive.extensions[_EXTENSION]
@@ -127,8 +128,8 @@ def read_gltf(path: Path) -> SplatFile:
         found = extension.get(name, expected)
         if found != expected:
             raise InputError(
-                f"{path} has a splat with {name} {str(found)[:40]!r}, expected {expected!r}. Export it with the "
-                "expected setting, or as a PLY file."
+                f"{path} has a splat with {name} {str(found)[:40]!r}, expected {expected!r}. Export the splat with "
+                "the expected setting, or as a PLY file."
             )
     compressed = next((extension["extensions"][n] for n in _SPZ_EXTENSIONS if n in _nested(extension)), None)
     if compressed is not None:
@@ -167,7 +168,9 @@ def _world_transform(gltf: _Gltf, mesh: int) -> WorldTransform:
     try:
         return decompose_similarity(matrix, f"The transform of the splat in {path}")
     except InputError as error:
-        raise InputError(f"{error} Apply it in the program that wrote the file, or export a PLY file.") from error
+        raise InputError(
+            f"{error} Apply the transform in the program that wrote the file, or export a PLY file."
+        ) from error
 
 
 def _local_matrix(path: Path, node: _Node) -> Float[np.ndarray, "4 4"]:
@@ -336,7 +339,7 @@ def _buffer_bytes(path: Path, buffer: _Buffer, binary: bytes) -> bytes:
             "a GLB file."
         )
     if not file.is_file():
-        raise FileNotFoundError(f"There is no file {file}, which {path.name} needs. Copy it into that folder.")
+        raise FileNotFoundError(f"{path.name} needs the file {file}, which does not exist. Copy it to this path.")
     return read_file(file, max_bytes=max(buffer.byte_length, 0) + 3)
 
 

@@ -14,7 +14,7 @@ from normlift_ns.io.guard import read_text
 from normlift_ns.options import Primitive, RasterizeMode
 
 _NAMES = ("cfg.yml", "cfg.json")
-"""Names of the file; that of simple_trainer_2dgs.py ends with .json, which is YAML too."""
+"""Names of the file. simple_trainer_2dgs.py writes a .json file, which is also valid YAML."""
 _MAX_BYTES = 2**18
 _FOLDERS = ("ckpts", "ply")
 _OF_3DGUT = ("with_ut", "with_eval3d")
@@ -30,7 +30,7 @@ class GsplatConfig(NamedTuple):
     test_every: int | None
     primitive: Primitive | None
     clip_planes: tuple[float, float] | None
-    """Near and far plane in world units."""
+    """Near and far planes in world units."""
 
 
 def find_gsplat_config(splat: Path) -> GsplatConfig | None:
@@ -106,5 +106,5 @@ def _check_primitive(path: Path, camera_model: str | None, model_type: str | Non
         return
     raise InputError(
         f"According to {path}, the splat was trained with {problem}. Expected 3D or 2D Gaussians and pinhole cameras. "
-        "Train it again with simple_trainer.py or simple_trainer_2dgs.py and undistorted images."
+        "Train the scene again with simple_trainer.py or simple_trainer_2dgs.py and undistorted images."
     )

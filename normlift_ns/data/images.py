@@ -28,15 +28,15 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, eval_images:
 
     Args:
         names: Sorted names of all images.
-        test_every: Interval n to hold out every n-th image from the first on, as in gsplat's trainer, and in Inria's
-            with --eval.
+        test_every: Interval n of held-out images, starting with the first image, as in gsplat's trainer and in Inria's
+            trainer with --eval.
         eval_images: Image names with or without folder and suffix, or a text file with one name per line, or a fraction
             below 1. For a fraction, the training images are evenly spaced, as in ns-train's data parser.
     Raises:
         ValueError: A name does not match an image, or both options are given.
     """
     if test_every is not None and len(eval_images) > 0:
-        raise InputError("--test-every and --eval-images are both given, expected at most one of them; omit one")
+        raise InputError("--test-every and --eval-images cannot be combined; omit one of them")
     if test_every is not None:
         if test_every < 2:
             raise InputError(f"--test-every must be at least 2, got {test_every}; omit it if nothing was held out")
@@ -70,7 +70,9 @@ def _fraction(eval_images: Sequence[str]) -> float | None:
 def _read_names(file: Path) -> list[str]:
     """Read image names from a text file, one per line."""
     if not file.is_file():
-        raise InputError(f"There is no file {file}, given with --eval-images. Give a file with one name per line.")
+        raise InputError(
+            f"The file {file}, given with --eval-images, does not exist. Give a file with one name per line."
+        )
     try:
         names = [line.strip() for line in read_text(file, "utf-8-sig").splitlines()]
     except UnicodeDecodeError as error:
@@ -93,8 +95,8 @@ def _matching(requested: str, names: Sequence[str]) -> list[str]:
     matches = [name for name in names if path.as_posix().endswith(f"/{name}")]
     if len(matches) != 1:
         raise InputError(
-            f"--eval-images {requested} does not match one of the {len(names)} images. Give the name of an image, from "
-            f"{names[0]} to {names[-1]}."
+            f"--eval-images {requested} does not match exactly one of the {len(names)} images. Give the name of an "
+            f"image, from {names[0]} to {names[-1]}."
         )
     return matches
 
@@ -189,8 +191,8 @@ class SplitViews:
             mask = np.array(opened).astype(bool)
         if mask.shape != image.shape[:2]:
             raise InputError(
-                f"the mask has shape {mask.shape}, expected {image.shape[:2]}, one channel with the size of the image; "
-                "save it in grayscale"
+                f"the mask has shape {mask.shape}, but must have one channel and the size of the image, "
+                f"{image.shape[:2]}; save it in grayscale"
             )
         return image, mask
 
@@ -294,8 +296,8 @@ class ImageViews(SplitViews):
 
     Images are undistorted as in nerfstudio's FullImageDatamanager, so stock commands use the same images. The camera
     matrix becomes OpenCV's optimal one without black borders, and images are cropped to its region of interest. Images
-    of fisheye cameras keep their size and at least 90 % of their pixels if a pinhole camera can show them (see
-    `fisheye_pinhole`); their masks are undistorted without interpolation, and are False at pixels that the original
+    of fisheye cameras keep their size, and at least 90 % of their pixels if a pinhole camera can show these (see
+    `fisheye_pinhole`). Their masks are undistorted without interpolation, and are False at pixels that the original
     image does not show.
 
     Args:
@@ -412,17 +414,17 @@ def _undistorted_fisheye(image: Any, lens: Intrinsics) -> tuple[Any, Any, tuple[
 
 
 def label_undistortion(*parts: Views) -> Callable[[str, np.ndarray], np.ndarray] | None:
-    """Return a function of an image name and its label maps [levels, H, W] that undistorts them.
+    """Return a function that undistorts label maps [levels, H, W], given the name of the image and the maps.
 
-    The result is None unless the views are `ImageViews` with fisheye cameras. Other views keep the size of an image, or
-    have label maps of the undistorted images.
+    The result is None unless the views are `ImageViews` with fisheye cameras. For all other views, label maps must fit
+    the undistorted images.
     """
     lenses = _fisheye_lenses(*parts)
     return None if len(lenses) == 0 else lambda name, maps: undistort_labels(maps, lenses[name])
 
 
 def filled_function(views: Views) -> Callable[[str, int, int], Bool[Tensor, "h w"]] | None:
-    """Return a function from an image name and a size to a mask of the pixels that the original image shows.
+    """Return a function that masks the pixels that the original image shows, given an image name, a height and a width.
 
     The result is None unless the views are `ImageViews` with fisheye cameras.
     """

@@ -28,7 +28,7 @@ def find_inria_config(splat: Path) -> InriaConfig | None:
     """Read the cfg_args of the training run that contains a PLY file.
 
     Returns:
-        The settings, or None if there is no cfg_args of Inria's trainer. Missing settings are those of its defaults.
+        The settings, or None if there is no cfg_args of Inria's trainer. Missing settings have the trainer's defaults.
     Raises:
         ValueError: if the file is damaged.
     """

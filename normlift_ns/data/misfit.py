@@ -18,12 +18,12 @@ from normlift_ns.data.reduced_views import ReducedView
 _SIDES = (50, 100, 200)
 """Longer sides of the images in pixels, from the coarsest search to the finest."""
 _HALVINGS, _MAX_MOVES = 2, 8
-"""Halvings of the step on images of each size, and largest number of moves by a step."""
+"""Number of halvings of the step for each image size, and maximum number of moves for each step."""
 _MIN_GAIN = 1.0
-"""Gain in dB that counts. A focal length that is 2 % off costs about 15 dB on a sharp scene, so 1 dB is well beyond
-chance."""
+"""Minimum gain in dB of a better lens. On a sharp scene, a focal length with an error of 2 % costs about 15 dB, so a
+gain of 1 dB is not due to chance."""
 _MIN_OVERLAP = 0.25
-"""Share of the pixels that a changed lens must leave to compare."""
+"""Minimum share of the pixels that can still be compared after a change of the lens."""
 
 
 class Lens(NamedTuple):
@@ -49,7 +49,7 @@ _PROBES = (
 
 
 class _Pair(NamedTuple):
-    """An image and a render of the same size, both blurred, because a changed lens interpolates."""
+    """An image and a render of the same size. Both are blurred, because interpolation for a lens blurs the image."""
 
     image: Float[Tensor, "1 4 h w"]
     """RGB in 0..1, and 1 at pixels that count."""
@@ -58,7 +58,7 @@ class _Pair(NamedTuple):
     center: tuple[float, float]
 
     def compare(self, lens: Lens) -> tuple[float, float]:
-        """Return PSNR of the render and of the mean color, in dB, with another lens; -inf without overlap."""
+        """Return the PSNR in dB of the render and of the mean color for another lens; -inf and 0 without overlap."""
         height, width = self.image.shape[2:]
         (fx, fy), (cx, cy) = self.focal, self.center
         x, y = (torch.arange(width) + 0.5 - cx) / fx, ((torch.arange(height) + 0.5 - cy) / fy)[:, None]
@@ -99,17 +99,17 @@ def explain_misfit(
     min_psnr: float,
     min_margin: float,
 ) -> str | None:
-    """Return a sentence about a change that makes the renders fit the images; None if there is no such change.
+    """Return a sentence about a change that makes the renders fit the images; None if no change does.
 
     Changes of the lens are tried by warping the images, so nothing is rendered.
 
     Args:
         views: views of the images.
-        renders: their renders.
+        renders: render of each view.
         render_flat: function that renders a view as 2D Gaussians. If None, the renders are good enough, and only small
             changes of the lens are tried.
         min_psnr: PSNR in dB that the change must reach.
-        min_margin: distance in dB that it must have from the PSNR of the mean color.
+        min_margin: lead in dB over the PSNR of the mean color that the change must reach.
     """
     levels = [[_pair(small.reduced(side), small, image) for small, image in zip(views, renders)] for side in _SIDES]
     before = _mean(levels[-1], Lens())[0]
@@ -167,8 +167,8 @@ def _fit(levels: Sequence[Sequence[_Pair]], search: _Search) -> Lens:
 
 
 _FLAT = (
-    "Drawn as flat Gaussians, the splat fits the images {gain}. It seems to come from 2D Gaussian splatting, which has "
-    "another primitive."
+    "Rendered as flat Gaussians, the splat fits the images {gain}. It was probably trained by 2D Gaussian Splatting, "
+    "whose primitives are flat."
 )
 
 
@@ -177,18 +177,20 @@ def _describe(lens: Lens, views: Sequence[ReducedView]) -> str:
     if lens.focal != 1.0:
         side = "longer" if lens.focal > 1 else "shorter"
         return (
-            f"Focal lengths that are {100 * abs(lens.focal - 1):.2g}% {side} fit the images {{gain}}. The cameras may "
-            "not be those of the training: has their file changed since, or were the images resized?"
+            f"Focal lengths that are {100 * abs(lens.focal - 1):.2g}% {side} fit the images {{gain}}. The training "
+            "probably used other cameras: has the camera file changed since, or were the images resized?"
         )
     if lens.k1 != 0.0:
         return (
             f"A radial distortion k1 that is {'higher' if lens.k1 > 0 else 'lower'} by {abs(lens.k1):.2g} fits the "
-            "images {gain}. Are these images distorted and the cameras those of undistorted ones, or the reverse?"
+            "images {gain}. Check whether the images are distorted and the cameras are those of undistorted images, or "
+            "the reverse."
         )
     width = views[0].view.camera.width * views[0].divisor
     shifts = (lens.x, "right", "left"), (lens.y, "down", "up")
     pixels = [f"{abs(width * shift):.1f} pixels {more if shift > 0 else less}" for shift, more, less in shifts if shift]
     return (
-        f"A principal point that lies {' and '.join(pixels)} of the present one fits the images {{gain}}. Were the "
-        "images cropped since the training? Inria's trainer puts the principal point at the center of the image."
+        f"A principal point that lies {' and '.join(pixels)} of the present one fits the images {{gain}}. Check "
+        "whether the images were cropped after the training. Inria's trainer puts the principal point at the center "
+        "of the image."
     )

@@ -59,7 +59,7 @@ class SplatScene:
     remarks: tuple[str, ...] = ()
     """Warnings about the images, in whole sentences."""
     alignment: Alignment | None = None
-    """Agreement with the images by the rules of gsplat 1.4, if it was measured to find the world."""
+    """Agreement with the images under the rules of gsplat 1.4; None unless the search for the world measured it."""
 
     renderer = None
     """Renderer of another package; None, because `normlift_ns` renders this scene."""
@@ -165,7 +165,7 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
     checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_DIR, load_step))
     if data is not None and not data.is_dir():
         raise FileNotFoundError(
-            f"There is no folder {data}, given with --data. Give the new path of {saved.photographs}."
+            f"The folder {data}, given with --data, does not exist. Give the new path of {saved.photographs}."
         )
     cameras = read_transforms(
         run_dir / TRANSFORMS_FILE,
@@ -222,8 +222,8 @@ def with_frames(scene: AnyScene, frames: Sequence[Frame]) -> AnyScene:
     """Return the scene with additional training views. Their cameras must be in the world of the scene.
 
     Raises:
-        FileNotFoundError, ValueError: An image is missing or cannot be read, or only one of it and the images of a
-            `SplatScene` has a fisheye camera.
+        FileNotFoundError, ValueError: An image is missing or cannot be read, or a `SplatScene` would have both fisheye
+            and perspective cameras.
     """
     views = ImageViews(frames, scene.background)
     remarks = (*scene.remarks, *views.check_files())
@@ -323,7 +323,8 @@ def open_stored_run(load_config: str | Path, data: str | Path | None = None) -> 
         load_config: Path of the config.yml of the run.
         data: Current path of the dataset, if it was moved.
     Raises:
-        FileNotFoundError, ValueError: The errors of `open_scene`, or the run has no semantic field of its Gaussians.
+        FileNotFoundError, ValueError: As in `open_scene`; also if the run has no semantic field, or a field of other
+            Gaussians.
     """
     folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
     check_run(folder)

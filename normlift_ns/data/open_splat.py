@@ -44,11 +44,11 @@ def open_splat(
     device: str = "auto",
     say: Callable[[str], None] = lambda text: None,
 ) -> SplatScene:
-    """Open a trained splat and its images, in the world in which it fits them.
+    """Open a trained splat and its images, with the cameras in the world in which the splat fits the images.
 
     Args:
         path: A plain or compressed PLY file, an SPZ, .splat, GLB or glTF file, or ckpt_<step>_rank<r>.pt of gsplat's
-            simple_trainer. The format is detected by the first bytes. Installed packages may add formats by suffix.
+            simple_trainer. The format is detected from the first bytes. Installed packages may add formats by suffix.
         options: Paths of the cameras and images, and settings of the splat.
         device: auto, cpu or cuda; device of the renders that find the world.
         say: Function that is called with one sentence per assumption, for example `print`.
@@ -173,11 +173,11 @@ _JSON_FORMATS = {"meta.json": "SOG", "lod-meta.json": "streamed SOG"}
 _BY_SPLAT_TRANSFORM = ("SOG", "KSPLAT", "LCC")
 _DOWNLOAD = "Download the file itself instead of the page that shows it."
 _STRANGERS = {
-    b"version https://git-lfs": ("a pointer of Git LFS", "Fetch the file that it stands for, with: git lfs pull"),
+    b"version https://git-lfs": ("a pointer of Git LFS", "Fetch the file itself with: git lfs pull"),
     b"<!doctype html": ("an HTML page", _DOWNLOAD),
     b"<html": ("an HTML page", _DOWNLOAD),
 }
-"""First bytes of files that downloads leave in the place of a splat, with their kind and advice."""
+"""First bytes of files that a failed download leaves instead of a splat, with their kind and advice."""
 SPLAT_READERS = Registry(
     "normlift_ns.scenes",
     {
@@ -238,24 +238,24 @@ def _with_gsplat_config(file: SplatFile, path: Path) -> SplatFile:
         test_every=config.test_every,
         primitive=file.primitive or config.primitive,
         clip_planes=config.clip_planes,
-        remarks=(*file.remarks, f"The settings of the training are those of {config.path}."),
+        remarks=(*file.remarks, f"The training settings come from {config.path}."),
     )
 
 
 def _with_inria_config(file: SplatFile, path: Path, options: SplatOptions) -> tuple[SplatFile, Background]:
-    """Add the settings in the cfg_args of the training run to the contents of a file; return the background, too."""
+    """Add the settings in the cfg_args of the training run to the contents of a file; also return the background."""
     config = find_inria_config(path)
     if config is None:
         return file, options.background or "black"
     test_every = TEST_EVERY if config.has_test_images and options.colmap is not None else None
-    remarks = (*file.remarks, f"The settings of the training are those of {config.path}.")
+    remarks = (*file.remarks, f"The training settings come from {config.path}.")
     mode = file.rasterize_mode or ("antialiased" if config.antialiased else None)
     file = file._replace(rasterize_mode=mode, test_every=file.test_every or test_every, remarks=remarks)
     return file, options.background or ("white" if config.white_background else "black")
 
 
 _CLIP_PLANES = (0.2, 1e10)
-"""Near and far plane of the 2DGS trainers of gsplat and Inria, in world units, if no file names them."""
+"""Near and far planes of the 2DGS trainers of gsplat and Inria, in world units, if no file contains them."""
 
 
 def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> SplatFile:
@@ -267,16 +267,18 @@ def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> Splat
     named: Primitive = "2dgs" if "2dgs" in path.name.lower() else "3dgs"
     if options.primitive is not None and file.primitive not in (None, options.primitive):
         raise InputError(
-            f"{path} has {file.primitive} Gaussians, by its scales or by the settings of its training, but --primitive "
-            f"is {options.primitive}. Omit --primitive, or give the file of another training."
+            f"{path} has {file.primitive} Gaussians, according to its scales or its training settings, but "
+            f"--primitive is {options.primitive}. Omit --primitive, or give another file."
         )
     if (options.primitive or file.primitive or named) == "3dgs":
         is_usual = file.clip_planes == (RasterSettings.near_plane, RasterSettings.far_plane)
         return file._replace(primitive="3dgs", clip_planes=None if is_usual else file.clip_planes)
     if options.rasterize_mode == "antialiased":
-        raise InputError(f"{path} holds 2D Gaussians, which have no antialiasing; omit --rasterize-mode antialiased.")
+        raise InputError(
+            f"{path} contains 2D Gaussians, which do not support antialiasing; omit --rasterize-mode antialiased."
+        )
     near, far = planes = file.clip_planes or _CLIP_PLANES
-    remark = f"{path.name} holds 2D Gaussians, drawn from {near:g} to {far:g} world units in front of a camera."
+    remark = f"{path.name} contains 2D Gaussians, rendered from {near:g} to {far:g} world units in front of a camera."
     return file._replace(
         splat=flatten_splat(file.splat),
         rasterize_mode="classic",

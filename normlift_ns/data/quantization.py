@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 _OTHERS = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Indices of the three other components of a quaternion, by the index of its largest one."""
+"""Indices of the three other components of a quaternion, by the index of its largest component."""
 _MIN_OPACITY = 1e-6
 
 

@@ -18,11 +18,11 @@ from normlift_ns.rasterization.settings import RasterSettings
 _MAX_SIDE = 400
 """Longer side in pixels."""
 _MAX_DIVISOR_AS_TRAINED = 4.0
-"""Divisor of an image's size below which it is compared with a render in the trained mode, with the rasterizer's 0.3
-square pixels scaled down. Above it, that render would be too thick. An antialiased one is used instead, which preserves
-the mean of Gaussians smaller than a pixel."""
+"""Divisor of the image size below which an image is compared with a render in the trained mode, with the rasterizer's
+blur of 0.3 square pixels scaled down. With a larger divisor, this render would be too thick. An antialiased render is
+used instead, which preserves the mean of Gaussians smaller than a pixel."""
 _SMALL_EPS2D = 0.1
-"""Square pixels that the antialiased renders add to projected Gaussians."""
+"""Variance in square pixels that the antialiased renders add to projected Gaussians."""
 
 
 class ReducedView(NamedTuple):
@@ -82,6 +82,6 @@ def sample_views(scene: Scene) -> list[ReducedView]:
     if len(usable) == 0:
         raise InputError(
             f"The masks of {', '.join(small.view.name for small in views)} leave no pixels. Expected masks that are "
-            "zero at pixels to ignore; are they inverted?"
+            "zero at pixels to ignore. Check whether they are inverted."
         )
     return usable

@@ -172,9 +172,9 @@ class SplatFile(NamedTuple):
     remarks: tuple[str, ...] = ()
     """Messages about the file, such as rounding errors of a compressed format."""
     primitive: Primitive | None = None
-    """Kind of the Gaussians; None if the file does not name it."""
+    """Kind of the Gaussians; None if the file does not contain it."""
     clip_planes: tuple[float, float] | None = None
-    """Near and far plane of the training in world units; None if the file does not name them."""
+    """Near and far planes of the training in world units; None if the file does not contain them."""
 
 
 _FLATNESS = math.log(1e-3)
@@ -237,10 +237,12 @@ def read_ply(path: Path) -> SplatFile:
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: The file is not a PLY file, is truncated, does not contain a splat, or has Gaussians that cannot be
-            drawn. The number of spherical harmonics must match a degree.
+            rendered. The number of spherical harmonics must match a degree.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no PLY file at {path}. Give the file of a trained splat with --load-ply.")
+        raise FileNotFoundError(
+            f"The PLY file {path} does not exist. Give the file of a trained splat with --load-ply."
+        )
     check_ply_header(path)
     data = _parse_ply(path)
     vertex = next((element for element in data.elements if element.name == "vertex"), None)
@@ -284,7 +286,7 @@ def _remarks(path: Path, vertex: PlyElement, rest: list[str], modes: list[str]) 
 def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Path) -> SplatParameters:
     """Convolve Gaussians with isotropic Gaussians of standard deviations `widths`, as Mip-Splatting does.
 
-    The opacity falls in proportion to the growth of the volume.
+    The opacity decreases in proportion to the growth of the volume.
     """
     if not bool((widths.isfinite() & (widths >= 0)).all()):
         raise InputError(f"{path}: filter_3D has invalid values, expected finite numbers >= 0. Export the scene again.")
@@ -344,7 +346,7 @@ def _not_ply(path: Path, error: Exception) -> InputError:
 
 
 def _check_properties(path: Path, vertex: PlyElement) -> bool:
-    """Return whether the vertices are 2D Gaussians, which have two scales; raise InputError for other properties."""
+    """Return True if the vertices are 2D Gaussians, which have two scales; raise InputError for other properties."""
     names = {item.name for item in vertex.properties}
     required = [name for columns in _COLUMNS.values() for name in columns]
     missing = [name for name in required if name not in names]
@@ -397,7 +399,7 @@ def check_ply_header(path: Path) -> None:
 
 def _advice(missing: list[str]) -> str:
     if all(name.startswith("f_dc_") for name in missing):
-        return "Its colors are not spherical harmonics. Export it again with f_dc_*."
+        return "Its colors are not spherical harmonics. Export the splat again with f_dc_*."
     return "Give the PLY file that the trainer or ns-export gaussian-splat wrote, not the initial point cloud."
 
 

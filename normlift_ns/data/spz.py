@@ -73,7 +73,7 @@ def encode_spz(
         version: Version of the format. More programs read version 3; version 4 is newer.
         position_step: Positions may be rounded to steps of up to this length, which makes the file smaller.
     Raises:
-        ValueError: A Gaussian that can be drawn is further than 8,388,607 from the origin along an axis.
+        ValueError: A Gaussian that can be drawn is farther than 8,388,607 from the origin along an axis.
     """
     drawable = splat.activated.drawable.cpu()
     means, quats, scales, logits, colors, rest = (
@@ -105,10 +105,10 @@ def read_spz(path: Path) -> SplatFile:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is not an SPZ file, is truncated or damaged, or its Gaussians cannot be drawn.
+        ValueError: The file is not an SPZ file, is truncated or damaged, or its Gaussians cannot be rendered.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no SPZ file at {path}. Give the file of the splat with --load-ply.")
+        raise FileNotFoundError(f"The SPZ file {path} does not exist. Give an existing file with --load-ply.")
     with open_regular(path) as file:
         return decode_spz(file.read(), path)
 

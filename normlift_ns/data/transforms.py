@@ -41,7 +41,7 @@ DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _DISTORTION_VALUES = (*DISTORTION, "k5", "k6", "distortion_params")
 _LEGACY_FLIP = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 _MAX_JSON_BYTES = 2**27
-"""Maximum size of a JSON file. Ten thousand frames take a tenth of it."""
+"""Maximum size of a JSON file. Ten thousand frames take a tenth of this size."""
 
 
 class CameraEntry(msgspec.Struct):
@@ -118,7 +118,7 @@ def read_json_file(path: Path, expected: str) -> Any:
         ValueError: The file is too large, is not valid JSON, or is nested too deeply.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no file {path}. Expected {expected}.")
+        raise FileNotFoundError(f"The file {path} does not exist. Expected {expected}.")
     if path.stat().st_size > _MAX_JSON_BYTES:
         raise InputError(
             f"{path} has {path.stat().st_size:,} bytes, expected at most {_MAX_JSON_BYTES:,}. Give {expected}."
@@ -209,7 +209,7 @@ class CameraFile(NamedTuple):
     applied_scale: float = 1.0
     """Scale of `applied_transform`."""
     remarks: tuple[str, ...] = ()
-    """Messages about choices that the reader made, in whole sentences."""
+    """Messages about ambiguous files, in whole sentences."""
 
 
 def read_transforms(
@@ -558,7 +558,7 @@ def capture_transforms(run_dir: Path, identity: Mapping[str, Any]) -> tuple[Worl
         identity: Identity of the scene. For a splat without a nerfstudio run, `source_world` is the transform of its
             cameras.
     Raises:
-        FileNotFoundError, ValueError: The errors of `read_dataparser_transforms`, or `source_world` is invalid.
+        FileNotFoundError, ValueError: As in `read_dataparser_transforms`; also if `source_world` is invalid.
     """
     trained = read_dataparser_transforms(run_dir / "dataparser_transforms.json")
     source = identity.get("source_world")
@@ -640,16 +640,17 @@ def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World
 def gsplat_normalization(frames: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> WorldTransform:
     """Compute the normalization of a COLMAP project by gsplat's simple_trainer, which does not save it.
 
-    The steps are those of gsplat 1.5, datasets/normalize.py and datasets/colmap.py. The first step turns the cameras
-    upright around the origin, at a median distance of 1. The second step rotates the principal axes of the points to x,
-    y and z, and flips the half with more points to the bottom.
+    The steps are those of gsplat 1.5, datasets/normalize.py and datasets/colmap.py. The first step makes the cameras
+    upright, and places them around the origin at a median distance of 1. The second step rotates the principal axes of
+    the points to x, y and z, and turns the half with more points to the bottom.
 
     Args:
         frames: All registered images, sorted by name.
         points: Points of the reconstruction, at least four.
     Returns:
-        The similarity of the trainer. That of a training may differ from it by half a turn about an axis. The signs of
-        the axes depend on the linear algebra library. Versions of gsplat before 1.5 do not flip the points.
+        The similarity of the trainer. The similarity of the actual training may differ by half a turn about an axis,
+        because the signs of the axes depend on the linear algebra library. Versions of gsplat before 1.5 do not flip
+        the points.
     Raises:
         ValueError: The normalization cannot be computed, or the trainer's formula mirrors the world.
     """
@@ -702,7 +703,7 @@ def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def _principal_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
-    """Return the transform that maps the median of points to the origin, their longest axis to x, the shortest to z."""
+    """Return the transform that maps the median of points to the origin, their longest axis to x and shortest to z."""
     center = np.median(points, axis=0)
     covariance = np.cov(points - center, rowvar=False)
     if not np.isfinite(covariance).all():

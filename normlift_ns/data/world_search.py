@@ -23,32 +23,34 @@ from normlift_ns.rasterization.projection import rotation_matrices
 from normlift_ns.rasterization.settings import RasterSettings
 
 _SIDE, _POINTS, _BATCH = 32, 8000, 64
-"""Longer side in pixels of the images that points are compared with, their number, and cameras compared together."""
+"""Longer side in pixels of the images that are compared with points, number of points, and number of cameras per
+batch."""
 _MAX_SAMPLED = 2**20
-"""Number of Gaussians among which the points are drawn."""
+"""Maximum number of Gaussians from which the points are sampled."""
 _SAME_DEPTH = 1.05
-"""Distance of a visible point, relative to that of the nearest point in the same pixel."""
+"""Maximum distance of a visible point, relative to that of the nearest point in the same pixel."""
 _LIKELY, _MAX_LIKELY = 0.7, 4
-"""Agreement of worlds that are rendered, relative to the best one, and their largest number."""
+"""Minimum agreement of worlds to render, relative to the best world, and maximum number of these worlds."""
 _SCALES = 1.12 ** np.arange(-61, 62)
 """Uniform scales that are tried, 0.001 to 1000."""
 _SHRINKING = (0.04, 0.02, 0.01)
-"""Step sizes of the logarithm of a scale, by which points refine it."""
+"""Successive step sizes, in the logarithm of the scale, when points refine a scale."""
 _PARABOLAS, _MAX_MOVES = ((100, 0.01), (400, 0.001)), 5
-"""Longer side of the renders that refine a scale further, and their distance in its logarithm; largest number of moves
-by this distance."""
+"""Longer side of the renders that refine a scale further, with the step between them in the logarithm of the scale;
+maximum number of these steps."""
 _MIN_START = 2.0
 """Minimum lead in dB of a first render over the mean color of its image."""
 _TURN, _TURNED_SIDE = math.radians(1), 200
-"""Angle of the turns that must fit worse than a world that is taken, and longer side of their renders in pixels."""
+"""Angle of the rotations with which a correct world fits worse, and longer side in pixels of the renders that check
+this."""
 _SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 _ROUND = 1e-3
-"""Relative distance below which a scale is rounded to a number of two digits."""
+"""Relative distance below which a scale is rounded to two digits."""
 
 
 class _Points(NamedTuple):
-    """Points drawn from the Gaussians of a scene, and the small images that they are compared with."""
+    """Points sampled from the Gaussians of a scene, and the small images that are compared with them."""
 
     positions: Float[Tensor, "n 3"]
     colors: Float[Tensor, "n 3"]
@@ -136,11 +138,11 @@ class _Search:
         return self._points.agreement([self._motion(candidate) for candidate in candidates])
 
     def likely(self, candidates: Sequence[CandidateWorld]) -> list[CandidateWorld]:
-        """Return the worlds that may fit, without the first one, the best first."""
+        """Return the worlds other than the first that may fit, by descending agreement."""
         return [candidates[i] for i in _likely(self.agreement(candidates)) if i > 0 and self._is_near(candidates[i])]
 
     def likely_scales(self, candidates: Sequence[CandidateWorld]) -> list[CandidateWorld]:
-        """Return worlds that may fit with another uniform scale, the best first."""
+        """Return worlds that may fit with another uniform scale, by descending agreement."""
         unscaled = [
             candidate for candidate in candidates if candidate.world.scale == 1 and not candidate.opencv_cameras
         ]
@@ -153,7 +155,7 @@ class _Search:
         return [world for world in found if world.world.scale != 1]
 
     def _is_near(self, candidate: CandidateWorld) -> bool:
-        """Return whether a small render beats the mean color of an image."""
+        """Return True if a small render fits an image clearly better than the mean color of the image does."""
         small = self._farthest(candidate).reduced(_PARABOLAS[0][0])
         return small.psnr(self._render(small, candidate)) >= small.psnr(small.mean_color()) + _MIN_START
 
@@ -174,7 +176,8 @@ class _Search:
     def _refine(self, candidate: CandidateWorld, log: float) -> float | None:
         """Return the logarithm of the scale that fits best, near a first guess; None if its render is not similar.
 
-        Points refine it to a few percent, and then parabolas through the mean squared errors of renders of one view.
+        Points refine the guess to a few percent. Parabolas through the mean squared errors of renders of one view then
+        refine it further.
         """
         for step in _SHRINKING:
             near = [log - step, log, log + step]
@@ -236,9 +239,10 @@ def _draw_points(scene: SplatScene, views: Sequence[ReducedView]) -> _Points:
 
 
 def _is_best_nearby(scene: SplatScene, device: str) -> bool:
-    """Return whether the images fit worse if the world turns by one degree, in both directions about each axis.
+    """Return True if the images fit worse after any rotation of the world by one degree about an axis.
 
-    A world that is only near the right one can reach the usual PSNR, but then one of the turns improves the fit.
+    A world that is only close to the correct one can reach the usual PSNR, but then one of the rotations improves the
+    fit.
     """
     gaussians, settings = scene.gaussians.to(device), RasterSettings.recorded(scene.identity)
     views = [view.reduced(_TURNED_SIDE) for view in sample_views(scene)]
@@ -305,10 +309,10 @@ def find_world(
     fits = "; ".join(f"{world.name} ({other.psnr:.1f} dB)" for world, _, other in found)
     if len(found) > 1:
         say(
-            f"The splat fits its images in several worlds: {fits}. It stays in {here.name} ({match.psnr:.1f} dB). "
-            "To use another one, give its transform as a file with --world-transform."
+            f"The splat fits its images in several worlds: {fits}. The first world, {here.name} ({match.psnr:.1f} "
+            "dB), is used. To use another world, give its transform as a file with --world-transform."
         )
         return scene
     _, other, other_match = found[0]
-    say(f"The splat fits its images in {fits}, so this world is used. It has {before}.")
+    say(f"The splat fits its images in {fits}, so this world is used. The PSNR is only {before}.")
     return replace(other, alignment=other_match)

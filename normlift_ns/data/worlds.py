@@ -50,7 +50,8 @@ class CandidateWorld(NamedTuple):
     opencv_cameras: bool = False
     """True if the camera file has poses with OpenCV's axes (y down, z forward), although its format has OpenGL's."""
     scale_since_training: float = 1.0
-    """Uniform scale that the splat got after its training. It applies to the clip planes of the training too."""
+    """Uniform scale that was applied to the splat after its training. It also applies to the clip planes of the
+    training."""
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
@@ -66,7 +67,7 @@ class CandidateWorld(NamedTuple):
         )
 
     def clip_planes(self, planes: tuple[float, float] | None) -> tuple[float, float] | None:
-        """Return the near and far plane of the training in units of this world; None for those of splatfacto."""
+        """Return the near and far planes of the training in units of this world; None for those of splatfacto."""
         if self.scale_since_training == 1:
             return planes
         near, far = planes or (RasterSettings.near_plane, RasterSettings.far_plane)
@@ -78,7 +79,7 @@ class CandidateWorld(NamedTuple):
 
 
 def with_opengl_axes(frames: Sequence[Frame]) -> list[Frame]:
-    """Return frames whose poses have OpenCV's axes with those of OpenGL."""
+    """Convert the poses of frames from OpenCV's axes to OpenGL's."""
     return [replace(frame, pose=frame.pose * _OPENCV_AXES) for frame in frames]
 
 
@@ -101,7 +102,7 @@ def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile
     if options.world_transform is None:
         return bases[:1]
     if options.gsplat_normalize and options.colmap is not None and not file.by_gsplat:
-        with suppress(ValueError, FileNotFoundError):  # a PLY file need not be of gsplat's trainer
+        with suppress(ValueError, FileNotFoundError):  # a PLY file may be from another trainer
             bases.append(_gsplat_world(options, cameras))
     bases += [*_applied_worlds(cameras), *_ns_train_worlds(options, cameras)]
     worlds: list[CandidateWorld] = []
@@ -127,14 +128,14 @@ def _gsplat_world(options: SplatOptions, cameras: CameraFile) -> CandidateWorld:
     """Recompute the normalization of gsplat's trainer from its COLMAP project."""
     if options.colmap is None:
         raise InputError(
-            "gsplat's trainer normalized the world of the splat by the points of its COLMAP project, so a "
+            "gsplat's trainer normalized the world of the splat with the points of its COLMAP project, so a "
             "transforms.json is not enough. Give the project with --colmap, or a known transform with "
             "--world-transform, or --gsplat-normalize False if the training used --no-normalize-world-space."
         )
     try:
         points = read_colmap_points(cameras.source)
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"gsplat's trainer normalized the world by points3D. {error}") from error
+        raise FileNotFoundError(f"gsplat's trainer normalized the world with points3D. {error}") from error
     if len(points) < _MIN_POINTS:
         raise InputError(
             f"{cameras.source} has {len(points)} points, too few to recompute the normalization of gsplat's trainer. "
@@ -145,7 +146,7 @@ def _gsplat_world(options: SplatOptions, cameras: CameraFile) -> CandidateWorld:
 
 
 def _applied_worlds(cameras: CameraFile) -> Iterator[CandidateWorld]:
-    """Yield the worlds before and after the transform that transforms.json names, unless it is not a similarity."""
+    """Yield the worlds before and after the transform in transforms.json, unless it is not a similarity."""
     if cameras.applied_transform is None:
         return
     matrix = np.diag([*[cameras.applied_scale] * 3, 1.0]) @ cameras.applied_transform
@@ -158,7 +159,7 @@ def _applied_worlds(cameras: CameraFile) -> Iterator[CandidateWorld]:
 
 
 def _ns_train_worlds(options: SplatOptions, cameras: CameraFile) -> Iterator[CandidateWorld]:
-    """Yield the world to which ns-train rotates, centers and scales these cameras by default, if they differ."""
+    """Yield the world to which ns-train rotates, centers and scales cameras by default, if their positions differ."""
     if len({tuple(frame.pose[:, 3].astype(np.float32)) for frame in cameras.frames}) == 1:
         return
     applied = np.eye(4)

@@ -18,7 +18,7 @@ from torch import Tensor
 from normlift_ns.core.gaussians import Camera, GaussianScene, facing_pose
 from normlift_ns.demo.room import DemoRoom
 from normlift_ns.io.atomic import atomic_file, write_text_file
-from normlift_ns.rasterization.rasterize import render
+from normlift_ns.rasterization.rasterize import render, render_views
 
 WIDTH, HEIGHT = 400, 300
 """Size of an image, in pixels."""
@@ -67,11 +67,11 @@ def write_capture(
     cameras = [*demo_cameras(views, width, height), *held_out_cameras(held_out, width, height)]
     paths = [f"images/{i:04d}.png" for i in range(len(cameras))]
     channels = torch.cat([room.colors, _one_hot(room)], dim=1)
-    for path, camera in zip(paths, cameras):
-        color, shares = render(room.scene, camera, channels)[0].tensor_split([3], dim=2)
-        for file, pixels in ((path, _image(color)), (f"instance/{Path(path).name}", _labels(shares))):
+    for path, (pixels, _) in zip(paths, render_views(room.scene, cameras, channels)):
+        color, shares = pixels.tensor_split([3], dim=2)
+        for file, picture in ((path, _image(color)), (f"instance/{Path(path).name}", _labels(shares))):
             with atomic_file(folder / file, overwrite=True, own=True) as draft:
-                Image.fromarray(pixels.numpy()).save(draft, compress_level=1)
+                Image.fromarray(picture.numpy()).save(draft, compress_level=1)
     (fx, _, cx), (_, fy, cy), _ = cameras[0].K.tolist()
     transforms = {
         "camera_model": "OPENCV",
@@ -149,7 +149,7 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
     with (
         # The metric would download its weights.
         patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Identity()),
-        patch("nerfstudio.utils.writer.EVENT_WRITERS", []),  # keep the writers of other trainings in this process
+        patch("nerfstudio.utils.writer.EVENT_WRITERS", []),  # keep the writers of other training runs in this process
     ):
         trainer.setup()
     dataset = trainer.pipeline.datamanager.train_dataparser_outputs

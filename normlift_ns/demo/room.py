@@ -93,7 +93,8 @@ class Surface(NamedTuple):
 
 
 SurfaceColors = Callable[[Sequence[Part], Surface, np.random.Generator], Array]
-"""Function that returns the sRGB colors [n, 3] of surface Gaussians with light and shadow. Values can exceed 0..1."""
+"""Function that returns the sRGB colors [n, 3] of surface Gaussians with light and shadow. Values can be outside
+0..1."""
 
 
 class _Gaussians(NamedTuple):
@@ -289,7 +290,7 @@ _WAVES = 9
 def noise(points: Array, size: float, seed: int = 0) -> Array:
     """Return smooth noise [n] with spots of about `size`, as a sum of plane waves with random directions.
 
-    Its mean is 0, and most values are in -1..1.
+    The mean of the noise is 0, and most values are in -1..1.
     """
     rng = np.random.default_rng(seed)
     waves = rng.normal(size=(_WAVES, 3)) * (2 / size)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 TORCHRUN_VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 """Environment variables that torchrun sets for distributed processes."""
 LAUNCHED_VARIABLE = "NORMLIFT_TEAM"
-"""Environment variable of the processes that `launch_processes` has started, and whose termination it reports."""
+"""Environment variable that marks processes started by `launch_processes`, which reports their termination."""
 _RESUME_HINT = "2D features and evidence of finished views are saved; run the command again to continue."
 _COLLECTIVE_TIMEOUT = timedelta(days=7)
 """Longest wait for other processes in a collective operation. Heartbeats detect lost processes earlier."""
@@ -63,7 +63,7 @@ def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | Non
 def launch_processes(commands: Sequence[Sequence[str]], log: Callable[[str], None]) -> int:
     """Run several processes on this machine that lift one scene together, and return the exit code.
 
-    If a process fails, all others are terminated. A process reports its own errors.
+    If a process fails, all others are terminated. Each process reports its own errors.
 
     Args:
         commands: Command line of each process.
@@ -271,7 +271,7 @@ def _wait(ready: Callable[[], bool], target: str, log: Callable[[str], None]) ->
 
 
 def _is_listening(host: str, port: int) -> bool:
-    """Return whether a server accepts connections at an address."""
+    """Return True if a server accepts connections at an address."""
     with suppress(OSError):
         socket.create_connection((host, port), timeout=5).close()
         return True

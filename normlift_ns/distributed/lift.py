@@ -145,7 +145,7 @@ def consensus_distributed(views: ViewObservations, portion: Partition, *, sample
     """Run `consensus` in several processes. Process 0 computes it from the sampled Gaussians of all processes.
 
     Args:
-        sample: Number of Gaussians; see `consensus`.
+        sample: Minimum number of Gaussians in every region; see `consensus`.
         options: Arguments `power` and `least` of `consensus`.
     """
     team, (evidence, features, level) = portion.communicator, views
@@ -162,7 +162,7 @@ def gather_sample(views: ViewObservations, portion: Partition, sample: int) -> t
     """Return the evidence of the Gaussians that all processes sample, by index, and their sampling probabilities.
 
     Args:
-        sample: Number of Gaussians of every region; see `consensus`.
+        sample: Minimum number of Gaussians in every region; see `consensus`.
     """
     team, evidence = portion.communicator, views.evidence
     chosen, probability = sample_gaussians(evidence.rows, evidence.num_regions, sample, portion)
@@ -185,8 +185,8 @@ def vote_distributed(
     """Run `vote_directions` in several processes.
 
     Returns:
-        The Gaussian whose direction each Gaussian of the partition takes, the options with all numbers of the vote, and
-        the gate and the counts of all Gaussians for the manifest.
+        The Gaussian whose direction each Gaussian of the partition takes, the options with the resolved parameters of
+        the vote, and the manifest entries (the gate and shares of all Gaussians).
     """
     team, gaussians = portion.communicator, portion.indices
     with stages("neighbors", len(gaussians)):

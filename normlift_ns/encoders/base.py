@@ -2,10 +2,11 @@
 
 Segmentation and encoding are separate steps. `Regions` segments an image, and an `Encoder` embeds regions and prompts
 in a joint space. `RegionFeatures` combines the two into a `FeatureSource`, the only protocol that the rest of the
-package uses. A source that reads labels and features together, such as an importer, implements it directly.
+package uses. A source that reads labels and features together, such as an importer, implements `FeatureSource`
+directly.
 
 An image can be segmented at several levels. The rasterizer computes evidence once, for the cells that all levels share
-(see `joint_partition`). The lift then sums it over the regions of the selected levels.
+(see `joint_partition`). The lift then sums the evidence over the regions of the selected levels.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from functools import cached_property
 from hashlib import blake2b
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -77,7 +78,7 @@ class ViewFeatures:
 
     @property
     def region_of_cell(self) -> Int32[Tensor, "levels c"]:
-        """Return `regions`, or the identity mapping if `regions` is None."""
+        """`regions`, or the identity mapping if `regions` is None."""
         return torch.arange(len(self.features), dtype=torch.int32)[None] if self.regions is None else self.regions
 
 
@@ -126,6 +127,20 @@ class FeatureSource(Protocol):
         Raises:
             ValueError: If `prompts` or a prompt is empty, or the encoder cannot embed a prompt.
         """
+        ...
+
+
+@runtime_checkable
+class StoredMaps(Protocol):
+    """Label maps or features that a program wrote to files, at a size that may differ from that of the images."""
+
+    @property
+    def resample(self) -> bool:
+        """True to accept maps of any size."""
+        ...
+
+    def size(self, name: str) -> tuple[Path, int, int]:
+        """Return the path, width and height of the map of an image."""
         ...
 
 
@@ -194,8 +209,8 @@ class RegionFeatures:
     regions: Regions
     encoder: Encoder
     filled: Callable[[str, int, int], Bool[Tensor, "h w"]] | None = None
-    """Function of the name, height and width of an image that returns True at pixels with a color; None if all have
-    one. Other pixels belong to no region."""
+    """Function that returns True at pixels with a color, given the name, height and width of an image; None if all
+    pixels have a color. Other pixels do not belong to a region."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -441,8 +456,8 @@ class PrecomputedFeatures:
     """A `FeatureSource` of precomputed labels, region features and prompt embeddings, on the CPU."""
 
     views: Mapping[str, tuple[Int[Tensor, "h w"], Float[Tensor, "r d"]]]
-    """Labels and vectors by image name. Labels are in 0..R-1, or -1 for none. Vectors can have any length; a zero
-    vector stands for no feature."""
+    """Labels and vectors by image name. Labels are in 0..R-1, or -1 for none. Vectors can have any norm; a zero vector
+    stands for no feature."""
     texts: Mapping[str, Float[Tensor, " d"]]
     """Embedding of each prompt."""
     divisor: int = 1

@@ -66,7 +66,7 @@ def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, An
 
 
 def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureSource:
-    """Recreate the feature source that a field was lifted from.
+    """Recreate the feature source from which a field was lifted.
 
     Args:
         device: Device of the networks; see `make_encoder`.

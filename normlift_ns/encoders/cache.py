@@ -38,7 +38,7 @@ def cached(source: FeatureSource, folder: Path, *, compute: Callable[[Any], bool
     """Return a source that caches its expensive results in a folder; return a source without such results unchanged.
 
     Args:
-        compute: Function that returns whether the given regions or encoder may compute results that are not cached.
+        compute: Function that returns True if the given regions or encoder may compute results that are not cached.
     Raises (when a view is requested):
         OSError: If the folder is not writable, for example because the disk is full.
         NotCachedError: If a result is not cached and `compute` returns False.
@@ -192,7 +192,7 @@ class CachedTextMasks:
 
 
 def _key_parts(tensor: Tensor) -> tuple[bytes, bytes]:
-    """Return the parts of a cache key that identify a tensor, its type with its shape and its content."""
+    """Return the parts of a cache key that identify a tensor: its type and shape, and its content."""
     return str((tensor.dtype, tuple(tensor.shape))).encode(), tensor.cpu().contiguous().numpy().tobytes()
 
 
@@ -209,12 +209,12 @@ def _read(
         if tensor is not None and is_valid(tensor):
             return tensor
     if not compute:
-        raise NotCachedError(f"{path.parent} no longer holds the {path.parent.name} of {image}; {REMEDY}")
+        raise NotCachedError(f"{path.parent} no longer contains the {path.parent.name} of {image}; {REMEDY}")
     return None
 
 
 def _are_labels(labels: Tensor, image: Tensor) -> bool:
-    """Return whether a cached tensor has valid label maps of the image, with consecutive ids in each level."""
+    """Return True if a cached tensor contains valid label maps of the image, with consecutive ids in each level."""
     matches = labels.dtype in (torch.int16, torch.int32) and labels.ndim == 4 and labels.shape[2:] == image.shape[:2]
     if not matches or labels.numel() == 0 or int(labels.min()) < -1 or int(labels.max()) >= labels[0].numel():
         return False
@@ -222,7 +222,7 @@ def _are_labels(labels: Tensor, image: Tensor) -> bool:
 
 
 def _are_units(rows: Tensor, count: int) -> bool:
-    """Return whether a cached tensor has `count` rows, each a unit vector or zero."""
+    """Return True if a cached tensor has `count` rows, each a unit vector or zero."""
     if rows.dtype != torch.float32 or rows.ndim != 2 or rows.shape[-1] == 0 or len(rows) != count:
         return False
     length = torch.linalg.vector_norm(rows, dim=-1)

@@ -7,8 +7,8 @@ factor. Colors are therefore compared in coordinates that discount this factor a
     p = 66 a* / (L* + 16),    q = 66 b* / (L* + 16),    x = (L* (1 + exp(-(p^2 + q^2) / 40^2)) / 2, p, q)
 
 Lightness counts fully for whites, grays and blacks, which differ only in lightness. It counts half for strong colors,
-whose lightness varies most in images. Each color is mapped to a unit vector phi(x). The cosine of two such vectors
-falls with the distance of their coordinates::
+whose lightness varies most in images. Each color is mapped to a unit vector phi(x). The cosine of two of these vectors
+decreases with the distance between their coordinates::
 
     <phi(x), phi(y)> = exp(-|x - y|^2 / (2 sigma^2)),    sigma = 30
 
@@ -48,8 +48,8 @@ _LEVELS = 7
 _LEVEL_POWER = 1.5
 """Exponent of the levels. Values above 1 make the lattice denser for dark colors, whose coordinates change fastest."""
 _OWN_SHARE = 0.2
-"""Weight of a name's own color, with the rest for the mean of its shades. A smaller weight would move pure blue closer
-to purple than to blue."""
+"""Weight of a name's own color; the mean of its shades has the remaining weight. A smaller weight would move pure blue
+closer to purple than to blue."""
 _JITTER = 1e-10
 _THREADS = min(8, os.cpu_count() or 1)
 """Number of images that are encoded concurrently."""
@@ -88,7 +88,7 @@ class ColorEncoder(LazyTextEncoder):
     def encode_each(
         self, views: Iterable[tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]]
     ) -> Iterator[Float32[Tensor, "r d"]]:
-        import torch  # noqa: PLC0415 (queries can do without torch)
+        import torch  # noqa: PLC0415 (queries do not need torch)
 
         from normlift_ns.core.device import prefetch_map  # noqa: PLC0415 (as above)
 

@@ -240,8 +240,8 @@ def _bilinear_samples(
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Return the positions and weights of bilinear interpolation of each square along one axis.
 
-    The result has two entries, for the pixels before and after each sample. An entry holds the positions in the image,
-    the weights, and True for pixels inside the box, False for pixels in the margin.
+    The result has two entries, for the pixels before and after each sample. An entry contains the positions in the
+    image, the weights, and a mask that is True for pixels inside the box and False for pixels in the margin.
     """
     center = (torch.arange(size, device=side.device) + 0.5) * (side[:, None].double() / size) - 0.5
     center = center.clamp(min=0)

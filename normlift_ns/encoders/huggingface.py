@@ -85,7 +85,7 @@ MODEL_FAMILIES = {
 
 
 def family_of_tokenizer(name: str) -> ModelFamily | None:
-    """Return the family that the name of a tokenizer class identifies, or None if it identifies none.
+    """Return the family that the name of a tokenizer class identifies, or None if no family matches.
 
     >>> family_of_tokenizer("GemmaTokenizerFast").title, family_of_tokenizer("SiglipTokenizer").title
     ('SigLIP 2', 'SigLIP')
@@ -193,7 +193,9 @@ def _read(path: Path, family: ModelFamily) -> ModelFolder:
     text, vision = (_sizes(config.get(f"{part}_config"), f"{part}_config") for part in ("text", "vision"))
     whole = {key: value for key, value in _sizes(config, CONFIG_FILE).items() if key == "projection_dim"}
     if vision.pop("vision_use_head", True) is not True:
-        raise InputError(f"according to {CONFIG_FILE}, the network has no pooling head and therefore no joint space")
+        raise InputError(
+            f"according to {CONFIG_FILE}, the network has no pooling head and cannot compare images with texts"
+        )
     tokens = _tokens(path, family)
     return ModelFolder(path, kind, text, vision, whole, _pixels(path, family, kind), tokens, _weights(path))
 
@@ -323,7 +325,7 @@ def _weights(path: Path) -> tuple[Path, ...]:
 
 
 def _is_shard(name: object) -> bool:
-    """Return whether a value is the name of a safetensors file, without a folder."""
+    """Return True if a value is the name of a safetensors file, without a folder."""
     return isinstance(name, str) and name.endswith(".safetensors") and name == os.path.basename(name)
 
 

@@ -1,9 +1,9 @@
 """Vocabulary of the 1,000 classes of ImageNet, with names, synonyms, hypernyms and the last words of names.
 
-`imagenet_words.json` has the names and hypernyms of all classes from WordNet 3.0. research/imagenet_words.py writes it.
-A name, such as "red fox", stands for all classes with that name. A hypernym, such as "dog" or "furniture", stands for
-all classes below it. The last word of a name, such as "panda", stands for all classes whose names end in it, unless it
-is itself a name or a hypernym. For example, "dog" does not include hot dog.
+`imagenet_words.json`, which research/imagenet_words.py writes, contains the names and hypernyms of all classes from
+WordNet 3.0. A name, such as "red fox", stands for all classes with that name. A hypernym, such as "dog" or "furniture",
+stands for all classes below it. The last word of a name, such as "panda", stands for all classes whose names end in
+this word, unless the word is itself a name or a hypernym. For example, "dog" does not include hot dog.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def find_classes(prompt: str) -> list[int]:
     ([277], [277, 278, 279, 280], [968])
 
     Raises:
-        InputError: If the prompt names no class.
+        InputError: If the prompt does not name a class.
     """
     _, word = _find_words(prompt)
     if word is not None:
@@ -51,7 +51,7 @@ def find_classes(prompt: str) -> list[int]:
 
 
 def known_words(prompt: str) -> str:
-    """Return the words of a prompt that `find_classes` uses, or "" if the prompt names no class.
+    """Return the words of a prompt that `find_classes` uses, or "" if the prompt does not name a class.
 
     >>> known_words("A red fox"), known_words("blue fox that sleeps")
     ('red fox', 'fox')
@@ -60,7 +60,7 @@ def known_words(prompt: str) -> str:
 
 
 def _find_words(prompt: str) -> tuple[str, str | None]:
-    """Return the words of a prompt that count and the vocabulary entry that they match, or "" and None."""
+    """Return the relevant words of a prompt and the vocabulary entry that they match, or "" and None."""
     text = _normalized(prompt)
     head = _AFTER_HEAD.sub("", text).split()
     for phrase in (text, *(" ".join(head[start:]) for start in range(len(head)))):
@@ -71,7 +71,7 @@ def _find_words(prompt: str) -> tuple[str, str | None]:
 
 
 def _normalized(text: str) -> str:
-    """Return the words of a text in lower case, separated by spaces instead of hyphens and other signs."""
+    """Return the words of a text in lower case, separated by spaces instead of hyphens and other punctuation."""
     return " ".join(re.findall(r"[^\W_]+(?:['.][^\W_]+)*", text.lower()))
 
 

@@ -28,8 +28,8 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from normlift_ns.core.device import AdaptiveBatches
 from normlift_ns.encoders.base import resize_image
 from normlift_ns.encoders.imagenet import find_classes
-from normlift_ns.encoders.package_files import IMAGENET
 from normlift_ns.encoders.text_files import check_prompts
+from normlift_ns.encoders.weights import IMAGENET
 from normlift_ns.segmentation.regions import resample_nearest
 
 WIDTH, CLASSES = 1280, 1000
@@ -97,7 +97,7 @@ class EfficientNetLite2(nn.Module):
 
 
 def load_network(content: bytes, device: str) -> EfficientNetLite2:
-    """Load the network from the content of a PyTorch weight file, whose names begin with underscores.
+    """Load the network from the content of a PyTorch weight file, in which names begin with underscores.
 
     Batch normalizations are fused into the preceding convolutions, which halves the time on a CPU.
     """
@@ -159,7 +159,7 @@ class ImageNetEncoder:
         a query needs one vector.
 
         Raises:
-            InputError: If `prompts` or a prompt is empty, or a prompt names no class.
+            InputError: If `prompts` or a prompt is empty, or a prompt does not name a class.
             FileNotFoundError: If the weights are not on this machine.
         """
         check_prompts(prompts)

@@ -62,7 +62,7 @@ def open_segment_map(path: Path) -> np.ndarray:
     shape_fits = segments.ndim == 3 and len(segments) in (1, len(LANGSPLAT_LEVELS)) and segments.size > 0
     if segments.dtype.kind not in "fiu" or not shape_fits:
         raise InputError(
-            f"segment map {path} holds {segments.dtype} {segments.shape}, expected numbers [4, H, W], [1, H, W] or "
+            f"segment map {path} is {segments.dtype} {segments.shape}, expected numbers [4, H, W], [1, H, W] or "
             "[H, W]; preprocess the image again"
         )
     return segments
@@ -85,13 +85,13 @@ def read_segment_map(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
     if len(fractional) > 0:
         channel, y, x = fractional[0].tolist()
         raise InputError(
-            f"segment map {path}: channel {channel}, row {y}, column {x} holds {values[channel, y, x]:g}, which is "
-            "not an integer, so the map was interpolated; make it again with nearest-neighbor interpolation"
+            f"segment map {path}: channel {channel}, row {y}, column {x} has the value {values[channel, y, x]:g}, "
+            "which is not an integer, so the map was interpolated; make it again with nearest-neighbor interpolation"
         )
     if segments.dtype.kind == "f" and segments.dtype.itemsize == 2 and bool((values >= _MAX_EXACT_HALF).any()):
         raise InputError(
-            f"segment map {path} holds float16 with ids of {_MAX_EXACT_HALF} or more, which float16 rounds; save it as "
-            "float32"
+            f"segment map {path} is float16 and has ids of {_MAX_EXACT_HALF} or more, which float16 rounds; save it "
+            "as float32"
         )
     past = values >= rows
     for invalid, problem in ((~finite, "that are not finite"), (past, f"past the {rows} rows of its table")):
@@ -99,7 +99,7 @@ def read_segment_map(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
             channels = shorten_list(np.flatnonzero(invalid.any(axis=(1, 2))).tolist())
             ids = shorten_list([f"{value:g}" for value in np.unique(segments[invalid])])
             warnings.warn(
-                f"segment map {path}: channels {channels} hold ids {problem} ({ids}), in {int(invalid.sum())} pixels; "
+                f"segment map {path}: channels {channels} have ids {problem} ({ids}), in {int(invalid.sum())} pixels; "
                 "these pixels are treated as unlabeled",
                 stacklevel=2,
             )
@@ -115,7 +115,7 @@ def open_feature_table(path: Path) -> np.ndarray:
     table = read_npy(path, "feature table")
     if table.dtype.kind != "f" or table.ndim != 2 or table.shape[1] < _MIN_DIMENSION:
         raise InputError(
-            f"feature table {path} holds {table.dtype} {table.shape}, expected floats [T, D], one CLIP vector per "
+            f"feature table {path} is {table.dtype} {table.shape}, expected floats [T, D], one CLIP vector per "
             "mask. If these are autoencoder codes (language_features_dim3), give the folder language_features instead"
         )
     return table
@@ -244,7 +244,7 @@ class LangSplat:
                 )
             warnings.warn(f"{problem}; the lift skips these images", stacklevel=2)
         maps = ((name, files.segments) for name, files in files_of.items())
-        check_files_distinct(maps, "features", "by naming the images such that they differ before the first dot")
+        check_files_distinct(maps, "features", "by naming the images so that they differ before the first dot")
         dimensions: dict[int, Path] = {}
         for files in files_of.values():
             dimensions.setdefault(open_feature_table(files.features).shape[1], files.features)
@@ -319,7 +319,7 @@ class LangSplat:
 
 
 def is_same_image(map_width: int, map_height: int, width: int, height: int) -> bool:
-    """Return whether a map can show the same image at a different resolution.
+    """Return True if a map can show the same image at a different resolution.
 
     The sizes must have the same aspect ratio, except for rounding of the smaller size to whole pixels. Sizes
     within 2 % of each other must be equal, because a small difference is probably a crop.
@@ -352,13 +352,25 @@ def check_unique_stems(names: Sequence[str]) -> None:
         ValueError: If the files of two images would have the same name.
     """
     files = ((name, Path(f"{_stem(name)}_s.npy")) for name in names)
-    remedy = "by renaming the images such that they differ before the first dot, or lift without the export"
+    remedy = "by renaming the images so that they differ before the first dot, or lift without the export"
     check_files_distinct(files, "exported file", remedy)
 
 
 def _stem(name: str) -> str:
     """Return the stem of the LangSplat files of an image."""
     return PurePosixPath(name).name.split(".")[0]
+
+
+class FeatureExport(NamedTuple):
+    """Export of 2D features to LangSplat files, in addition to the lift."""
+
+    folder: Path
+    overwrite: bool
+    """Replace existing files whose content differs."""
+
+    def write(self, source: FeatureSource, image: UInt8[Tensor, "h w 3"], name: str) -> None:
+        """Write the files of an image; see `write_langsplat`."""
+        write_langsplat(source, image, name, self.folder, self.overwrite)
 
 
 def write_langsplat(

@@ -31,7 +31,7 @@ def null_words() -> tuple[str, ...]:
 
 
 def null_vectors(source: FeatureSource, encoder: Mapping[str, Any]) -> Float[Tensor, "m d"] | None:
-    """Return the vectors of the null vocabulary of a lift, or None if it has none.
+    """Return the vectors of the null vocabulary of a lift, or None if the lift has no null vocabulary.
 
     The vocabulary of precomputed or imported features consists of the texts that were supplied with them.
 

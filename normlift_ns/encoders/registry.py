@@ -23,8 +23,7 @@ from normlift_ns.encoders.huggingface import (
     find_local_model,
     resolve_model_name,
 )
-from normlift_ns.encoders.package_files import IMAGENET
-from normlift_ns.encoders.weights import CONNECT_ONCE, check_hub_access, is_local_path, third_party_errors
+from normlift_ns.encoders.weights import CONNECT_ONCE, IMAGENET, check_hub_access, is_local_path, third_party_errors
 from normlift_ns.errors import InputError
 from normlift_ns.options import (
     CANONICAL_NEGATIVES,
@@ -68,12 +67,12 @@ class EncoderKind:
     The arguments are the options, the device, the cache folder, and the identity of the encoder at the lift ({} if it
     is unknown)."""
     has_patches: Callable[[SourceOptions], bool] = lambda options: False
-    """Function that returns whether the encoder is a `DenseEncoder`, which can embed patches."""
+    """Function that returns True if the encoder is a `DenseEncoder`, which can embed patches."""
     has_null_words: bool = True
     """True if the encoder can embed the words of `encoders.null_words`. Queries of new lifts then use the rule
     "contrast"."""
     known_words: Callable[[str], str] = str
-    """Function that returns the words of a prompt that the encoder uses, or "" if it ignores them all."""
+    """Function that returns the words of a prompt that the encoder uses, or "" if the encoder ignores all of them."""
     words: Callable[[], Sequence[str]] = tuple
     """Function that returns the words that name objects in an inventory, or () if there are none."""
     suggested: tuple[float, float] = (0.4, 0.8)
@@ -86,8 +85,8 @@ class EncoderKind:
     """True if the encoder processes each image once and averages inside regions, so that regions cost as much as
     patches."""
     is_here: Callable[[], bool] = lambda: False
-    """Function that returns whether the default weights and the packages of the encoder are on this machine. If not,
-    `--encoder auto` skips it."""
+    """Function that returns True if the default weights and the packages of the encoder are on this machine. Otherwise,
+    `--encoder auto` skips the encoder."""
     paths: tuple[str, ...] = ()
     """Names of options that can be the path of a file or folder. Runs store them as absolute paths."""
 
@@ -216,13 +215,13 @@ def _make_imagenet_encoder(options: SourceOptions, device: str) -> Encoder:
 
 
 def _imagenet_words() -> Sequence[str]:
-    from normlift_ns.encoders.imagenet import class_names  # noqa: PLC0415 (a file to read)
+    from normlift_ns.encoders.imagenet import class_names  # noqa: PLC0415 (reads a file)
 
     return tuple(dict.fromkeys(class_names()))
 
 
 def _known_to_imagenet(prompt: str) -> str:
-    from normlift_ns.encoders.imagenet import known_words  # noqa: PLC0415 (a file to read)
+    from normlift_ns.encoders.imagenet import known_words  # noqa: PLC0415 (reads a file)
 
     return known_words(prompt)
 
@@ -327,12 +326,12 @@ def canonical_name(encoder: str) -> str:
 
 
 def encoder_kind(name: str) -> EncoderKind:
-    """Return the encoder kind of a name. Raises the same errors as `Registry.load`."""
+    """Return the encoder kind with this name. Raises the same errors as `Registry.load`."""
     return ENCODERS.load(canonical_name(name))
 
 
 def find_encoder_kind(name: object) -> EncoderKind | None:
-    """Return the encoder kind of a name, or None if it is unknown or cannot be loaded."""
+    """Return the encoder kind with this name, or None if the name is unknown or the kind cannot be loaded."""
     try:
         return encoder_kind(name) if isinstance(name, str) else None
     except InputError:

@@ -52,7 +52,7 @@ class LazyTextEncoder(TextEncoder, Protocol):
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         """Return `rows` as a torch tensor."""
-        import torch  # noqa: PLC0415 (queries can do without torch)
+        import torch  # noqa: PLC0415 (queries do not need torch)
 
         return torch.from_numpy(self.rows(prompts))
 
@@ -66,7 +66,7 @@ def check_prompts(prompts: Sequence[str]) -> None:
     if isinstance(prompts, str):
         raise InputError(f"prompts must be a list of strings, got the single string {prompts!r}; write [{prompts!r}]")
     if len(prompts) == 0:
-        raise InputError('no prompt given; name at least one object to search for, for example --text "orange"')
+        raise InputError('no prompt is given; name at least one object to search for, for example --text "orange"')
     for prompt in prompts:
         if not isinstance(prompt, str) or re.search("[\0\ud800-\udfff]", prompt):
             raise InputError(f"a prompt must be a string of valid characters, got {prompt!r:.60}")
@@ -265,6 +265,8 @@ def _digest_comment(vectors: Mapping[str, np.ndarray]) -> bytes:
 CACHE_FORMAT = "normlift_ns.encoders/3"
 """Part of all cache keys. Increase its number if labels or features change for the same settings."""
 _ARRAY = "text"
+_MANY = 64
+"""Number of prompts above which they are cached as one list."""
 
 
 def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Path:
@@ -284,8 +286,8 @@ class CachedTextEncoder(LazyTextEncoder):
     make_encoder: Callable[[], TextEncoder]
     """Function that makes the encoder, called only for prompts that are not cached."""
     folder: Path | None
-    """Folder with one safetensors file per prompt, created if it does not exist. If it is None or not writable, nothing
-    is cached."""
+    """Folder with one safetensors file per prompt, or per list of more than `_MANY` prompts, created if it does not
+    exist. If it is None or not writable, nothing is cached."""
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
         """Return one unit vector per prompt.
@@ -294,14 +296,19 @@ class CachedTextEncoder(LazyTextEncoder):
             ValueError, FileNotFoundError, MemoryError: For the same reasons as `make_encoder` and the encoder's `text`.
         """
         check_prompts(prompts)
-        rows = {prompt: self._load(prompt) for prompt in prompts}
-        new = [prompt for prompt, row in rows.items() if row is None]
-        for prompt, row in zip(new, self._encoder.text(new).numpy() if len(new) > 0 else []):
-            rows[prompt], path = row, self._path(prompt)
+        # The thousand files of a vocabulary would take longer than its network.
+        keys = [tuple(prompts)] if len(prompts) > _MANY else [(prompt,) for prompt in prompts]
+        paths = {key: self._path("\n".join(key)) for key in keys}
+        blocks = {key: self._load(path, len(key)) for key, path in paths.items()}
+        new = [key for key, block in blocks.items() if block is None]
+        made = self._encoder.text([prompt for key in new for prompt in key]).numpy() if len(new) > 0 else np.empty(0)
+        for key, block in zip(new, np.split(made, len(new)) if len(new) > 0 else []):
+            blocks[key], path = block, paths[key]
             if path is not None:
                 with suppress(OSError):
-                    save_arrays(path, {_ARRAY: row}, key=path.stem, overwrite=True)
-        return np.stack([row for prompt in prompts if (row := rows[prompt]) is not None])
+                    save_arrays(path, {_ARRAY: block[0] if len(key) == 1 else block}, key=path.stem, overwrite=True)
+        rows = {prompt: row for key, block in blocks.items() if block is not None for prompt, row in zip(key, block)}
+        return np.stack([rows[prompt] for prompt in prompts])
 
     @cached_property
     def _encoder(self) -> TextEncoder:
@@ -319,16 +326,21 @@ class CachedTextEncoder(LazyTextEncoder):
     def _path(self, prompt: str) -> Path | None:
         return None if self.folder is None else cache_path(self.folder, self.identity, prompt.encode())
 
-    def _load(self, prompt: str) -> Float32[np.ndarray, " d"] | None:
-        """Return the cached vector of a prompt, or None if it is missing, damaged or not a unit vector."""
-        path = self._path(prompt)
+    def _load(self, path: Path | None, count: int) -> Float32[np.ndarray, "q d"] | None:
+        """Return the cached vectors of some prompts, or None if they are missing, damaged or not unit vectors."""
         try:
             row = None if path is None or not os.path.isfile(path) else load_arrays(path, key=path.stem).arrays[_ARRAY]
         except (FileNotFoundError, ValueError, KeyError):
             return None
-        if row is None or row.dtype != np.float32 or row.ndim != 1 or row.size == 0:
+        if (
+            row is None
+            or row.dtype != np.float32
+            or row.size == 0
+            or row.shape[:-1] != (() if count == 1 else (count,))
+        ):
             return None
-        return row if abs(float(np.linalg.norm(row)) - 1) < UNIT_TOLERANCE else None
+        rows = row.reshape(count, -1)
+        return rows if bool((np.abs(np.linalg.norm(rows, axis=1) - 1) < UNIT_TOLERANCE).all()) else None
 
 
 def open_clip_text_identity(model: str, pretrained: str, template: str) -> dict[str, Any]:

@@ -79,7 +79,7 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
 def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> EvaluatedRun:
     """Return the run with or without consensus.
 
-    A run with the other setting is lifted again from its regions and features, without refinement.
+    If the run has the other setting, it is lifted again from its regions and features, without refinement.
 
     Raises:
         ValueError, FileNotFoundError: if the features of the run are not available (see `lifted_batches`).
@@ -122,7 +122,7 @@ def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None =
         device: device of the networks.
         max_views: largest number of views, evenly spaced (default: all views of the lift).
     Raises:
-        ValueError: if the run does not record its features, or they came from a Python object or have changed.
+        ValueError: if the run does not record its features, or the features came from a Python object or have changed.
         FileNotFoundError: if files of the features are missing.
     """
     manifest, scene = lifted.field.manifest, lifted.scene
@@ -149,7 +149,7 @@ _CELL_EVIDENCE: dict[Baseline, Callable[[Rasterize, GaussianScene, ViewBatch], E
     "vala": _plain,
     "drsplat": lambda r, g, block: top_evidence(r, block.cameras, _columns(block), _plain(r, g, block)),
 }
-"""Function of every baseline that computes the evidence of the cells in some views."""
+"""Function that computes the evidence of the cells in some views, for each baseline."""
 
 
 def _columns(block: ViewBatch) -> list[Int[Tensor, "h w"]]:
@@ -303,7 +303,7 @@ def dense_sums(
 
 
 def timing_obstacle(lifted: EvaluatedRun, device: str) -> str | None:
-    """Return the reason that prevents the timing of SFS's method, or None if it can be timed."""
+    """Return the reason why SFS's method cannot be timed, or None if it can be."""
     if not device.startswith("cuda"):
         return f"gsplat needs a GPU, got --device {device}; use --device cuda"
     try:

@@ -69,7 +69,7 @@ class StudyImages(NamedTuple):
     names: list[str]
     cameras: list[Camera]
     reasons: list[LeftOutReason]
-    """Reason of every image that was not lifted."""
+    """Reason why an image was not lifted, for each of those images."""
     left_out: dict[LeftOutReason, int]
 
 
@@ -123,7 +123,7 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
 
 
 _HIDDEN_SHARE = 0.01
-"""Share of the surface of all Gaussians that are ignored because they are too small or too transparent."""
+"""Share of the total surface in Gaussians that are ignored because they are too small or too transparent."""
 _MIN_SHARE = 0.001
 """Smallest share of the surface in a listed region."""
 _MAX_REGIONS = 20
@@ -141,7 +141,7 @@ class WeakRegion:
     box: dict[str, list[float]]
     """Corners "min" and "max" of the bounding box of the centers, in scene units."""
     share: float
-    """Share of the surface in all images, in 0..1."""
+    """Share of the total surface in all images, in 0..1."""
     reliability: float
     """Mean R_j(S) of `evaluation.coverage`, in 0..1, which gives little weight to views that hardly show a Gaussian."""
     lifted_reliability: float
@@ -231,9 +231,10 @@ def _region(evidence: GaussianEvidence, rows: Int64[Tensor, " m"]) -> WeakRegion
 #     gain(v) = sum_j s_j max(0, R_j(S + v) - R_j(S)) / sum_j s_j
 #
 # The term with FAINT reduces N_j(S) for views that hardly show a Gaussian. Without evidence, ||f_j|| is the mean of the
-# other Gaussians, weighted by surface. The gain is the expected increase of the mean reliability of all surfaces. It
-# assumes that a new view agrees with the others as well as they agree with each other. Views are chosen greedily, by
-# their gain in addition to the views before. The second of two similar views therefore has a small gain.
+# other Gaussians, weighted by surface. The gain is the expected increase of the mean reliability of all surfaces. This
+# assumes that a new view agrees with the lifted views as well as these agree with each other. Views are chosen
+# greedily, by their gain in addition to the views chosen before. The second of two similar views therefore has a small
+# gain.
 
 
 PIXELS = 20_000

@@ -124,7 +124,7 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
 
 
 def _points(segmentation: Sequence[_Point], width: int, height: int) -> np.ndarray:
-    """Return the points of a polygon. Raise InputError if a point is outside the image by more than its size."""
+    """Return the points of a polygon. Raise InputError if a point is farther from the image than the image size."""
     points = np.array(segmentation, dtype=float)
     if np.abs(points / (width, height) - 0.5).max() > 1.5:
         raise InputError(
@@ -195,8 +195,8 @@ def prompt_mask(
     Args:
         masking: "background" selects scores that exceed every background word by the margin. "auto" selects scores
             above SFS's threshold, from their histogram and the number of true instances. "langsplat" and
-            "langsplat_composited" scale the relevancy to 0..1 over the image. They select a pixel if most pixels
-            around it exceed 0.7, which is 0.4 after 2 x - 1.
+            "langsplat_composited" scale the relevancy to 0..1 over the image. They select a pixel if most pixels around
+            it exceed 0.7, which LangSplat writes as 2 x - 1 > 0.4.
         margin: lead over the background words, in cosine.
         instances: number of true instances.
     """
@@ -239,8 +239,8 @@ def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"],
 def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: bool) -> list[dict[str, Any]]:
     """Compute IoU, recall and localization of each category.
 
-    A category is localized if its peak is in the mask. With LangSplat's maskings, any of several peaks in any box
-    suffices.
+    A category is localized if its peak is in the mask. With LangSplat's maskings, a category can have several peaks,
+    and it is localized if one of them is in one of its boxes.
     """
     rows = []
     frame, langsplat = scores.frame, masking in LANGSPLAT_MASKINGS
@@ -354,7 +354,7 @@ def _scale(lifted: EvaluatedRun, options: LerfOptions) -> Float[Tensor, "n 1"] |
 def _frame_scores(
     lifted: EvaluatedRun, camera: Camera, frame: LabeledFrame, length: Float[Tensor, "h w"] | None, options: LerfOptions
 ) -> FrameScores:
-    """Return composited scores, divided by the length of the feature of each pixel if it is given."""
+    """Return composited scores, divided by the feature length of each pixel if `length` is given."""
     prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT_MASKINGS
     negatives = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
     values, _ = lifted.composite(camera, _scale(lifted, options) * lifted.cosine((*prompts, *negatives)))

@@ -44,7 +44,8 @@ class ScannetOptions(CheckedOptions):
     """Options of --protocol scannet, which needs one *_vh_clean_2.labels.ply per run in --labels."""
 
     min_opacity: float = 0.1
-    """Smallest opacity of a scored Gaussian, in 0..1. Larger values score fewer Gaussians. 0 scores all."""
+    """Smallest opacity of a scored Gaussian, in 0..1. With larger values, fewer Gaussians are scored. With 0, all are
+    scored."""
     without_direction: WithoutDirection = "first"
     """Class of Gaussians without a direction. first assigns wall, as in published scripts. none assigns no class. The
     table also shows the result of the other choice."""

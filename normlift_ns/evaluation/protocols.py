@@ -61,7 +61,9 @@ def read_names(path: Path) -> Names:
     """
     expected = 'expected {"labels": {"1": "table", ...}}'
     if not os.path.lexists(path):
-        raise FileNotFoundError(f'mask names {path} do not exist; write {{"labels": {{"1": "table", ...}}}} to it')
+        raise FileNotFoundError(
+            f'the file of mask names {path} does not exist; write {{"labels": {{"1": "table", ...}}}} to it'
+        )
     try:
         document = read_document(path, dict[str, Any])
         named = msgspec.convert(document if "labels" in document else {"labels": document}, _NamesFile)
@@ -91,7 +93,7 @@ def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width:
         size = values.shape if len(values) > 1 else values.shape[1:]
         raise InputError(
             f"mask {masks.path(name)} has shape {size}, but its image {name} is {height} x {width} (height x width); "
-            "provide masks in the size of the undistorted images"
+            "provide masks of the same size as the undistorted images"
         )
     unique, inverse = np.unique(values[0], return_inverse=True)
     table = torch.tensor([names.class_of.get(int(value), NO_CLASS) for value in unique])

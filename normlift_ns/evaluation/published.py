@@ -1,4 +1,4 @@
-"""Results that the paper NormLift publishes, next to those of an evaluation."""
+"""Published results of the NormLift paper, for comparison with an evaluation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from normlift_ns.evaluation.options import Evaluation
 
 Numbers = Mapping[tuple[str, str], float]
-"""Numbers by row, which is a scene or a variant, and metric."""
+"""Numbers by row (a scene or a variant) and metric."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ TABLES: Mapping[str, PublishedTable] = {
 def compare_with_paper(
     evaluation: Evaluation, studies: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return the tables of the paper that an evaluation measures, with its own numbers as the column `yours`.
+    """Return the paper's tables that the evaluation can be compared with, and its results in the column `yours`.
 
     Args:
         evaluation: result of --protocol scannet or lerf. Studies belong to the data set of the paper: ablation and
@@ -194,12 +194,12 @@ def _of_rows(key: str, rows: Sequence[Mapping[str, Any]]) -> Numbers:
 
 
 def _of_signals(rows: Sequence[Mapping[str, Any]]) -> Numbers:
-    """Return the signals of all scenes together, which are those of the scene if there is only one."""
+    """Return the signals of all scenes together. For a single scene, these are its own."""
     return {("all scenes", metric): value for row in rows[-1:] for metric, value in row.items() if metric != "scene"}
 
 
 def _of_timing(rows: Sequence[Mapping[str, Any]]) -> Numbers:
-    """Return the seconds of the lift, with those of the evidence, and of the neighbors and the vote."""
+    """Return the seconds of the lift, including the evidence, and of the neighbors and the vote together."""
     parts = {"lift_s": ("evidence_s", "consensus_s", "lift_s"), "post_lift_s": ("neighbors_s", "vote_s")}
     return {
         (row["scene"], metric): sum(row.get(name, 0.0) for name in names)

@@ -151,8 +151,8 @@ def evaluate_scannet(scenes: Sequence[SceneLabels], options: ScannetOptions) -> 
         }
         if all(math.isnan(score.miou) for score in scores[without_direction]):
             raise InputError(
-                f"nothing can be scored with {classes} classes, because no Gaussian of {', '.join(names)} has one and "
-                f"an opacity of at least {min_opacity:g}; reduce --min-opacity or check the labels"
+                f"nothing can be scored with {classes} classes, because no Gaussian of {', '.join(names)} has one of "
+                f"these classes and an opacity of at least {min_opacity:g}; reduce --min-opacity or check the labels"
             )
         for rule, suffix in ((without_direction, ""), (other, f"_{other}")):
             results[f"miou_{classes}{suffix}"] = mean([s.miou for s in scores[rule]])

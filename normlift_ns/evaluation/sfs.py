@@ -71,7 +71,7 @@ def _valley(counts: list[int], instances: int) -> int | None:
 
 
 def _otsu(counts: Int64[Tensor, " bins"], edges: Float[Tensor, " edges"]) -> float:
-    """Return the float32 center of the last bin of the lower side in the split with the largest variance between
+    """Return Otsu's threshold: the float32 center of the last bin below the split with the largest variance between
     sides."""
     center, share = (edges[:-1] + edges[1:]) / 2, counts.float() / int(counts.sum())
     below, moment = share.cumsum(0), (share * center).cumsum(0)

@@ -184,8 +184,8 @@ def recorded_vote(manifest: Mapping[str, Any]) -> Vote:
 def voting_scalars(field: SemanticField) -> Scalars:
     """Return the scalars for a vote on a run.
 
-    With consensus, ||f|| is the value before the consensus, from which the paper's R was computed. Other kinds of R do
-    not give this value, and the vote then reads ||f|| and R as they are stored.
+    With consensus, ||f|| is the value before the consensus, from which the paper's R was computed. For other kinds of
+    R, this value is unknown, and the vote uses ||f|| and R as stored.
     """
     scalars, options = field.scalars, field.manifest.get("options", {})
     if not options.get("consensus", False) or options.get("reliability", "paper") != "paper":
@@ -303,7 +303,7 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
     `reliability.bin1` … `bin10` and `norm.bin1` … are the accuracies of unrefined predictions in ten bins of equal
     count. `….spearman_bins` is their rank correlation with the bin number. `histogram.0.00` … are shares by R.
 
-    The p-values assume that Gaussians are independent, but neighbors are not.
+    The p-values assume that Gaussians are independent, but neighbors are not independent.
     """
     reliability, norm, views = (
         torch.cat([getattr(scene.scalars, name) for scene in scenes]) for name in ("reliability", "norm", "view_count")

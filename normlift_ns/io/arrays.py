@@ -1,8 +1,8 @@
 """Files of arrays: safetensors files with a digest of their whole content, and NPY files of other programs.
 
-Loading checks the digest before it returns any content. NumPy arrays do not need torch. The digest is the 128-bit XXH3.
-It detects damaged and misplaced files, but does not protect against forgery. One core of an AMD EPYC hashes 31 GB/s
-with XXH3 and 0.9 GB/s with BLAKE2b. A field of 44 MB takes 1.5 ms instead of 50 ms.
+Loading checks the digest before it returns any content. Saving and loading NumPy arrays does not import torch. The
+digest is the 128-bit XXH3. It detects damaged and misplaced files, but does not protect against forgery. One core of an
+AMD EPYC hashes 31 GB/s with XXH3 and 0.9 GB/s with BLAKE2b. A field of 44 MB takes 1.5 ms instead of 50 ms.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def save_arrays(
     key: str = "",
     overwrite: bool = False,
 ) -> str:
-    """Write a safetensors file, and return the digest that its metadata also contains.
+    """Write a safetensors file, and return its digest, which is also stored in its metadata.
 
     Args:
         arrays: NumPy arrays only, or tensors only.
@@ -150,7 +150,7 @@ def load_arrays(
     remedy: str = "write it again",
     framework: str = "np",
 ) -> ArrayFile:
-    """Read a file of `save_arrays` and check its digest.
+    """Read a file that `save_arrays` wrote, and check its digest.
 
     Args:
         key: Key that the file was saved with.
@@ -206,8 +206,8 @@ def check_array(
 def _extremes(array: np.ndarray) -> tuple[float, float]:
     """Return the smallest and the largest value of an array; one or both are NaN if it contains NaN.
 
-    NumPy compares float16 numbers one at a time. As integers, with the other bits of negative numbers inverted, their
-    bits have the same order and are compared twenty times as fast.
+    NumPy compares float16 numbers one at a time. Their bits, read as int16, have the same order after
+    `_flip_negative`, and NumPy compares int16 numbers twenty times as fast.
 
     >>> _extremes(np.array([[0.5, -2], [-0.0, 3]], np.float16))
     (-2.0, 3.0)
@@ -222,7 +222,7 @@ def _extremes(array: np.ndarray) -> tuple[float, float]:
 
 
 def _flip_negative(bits: np.ndarray) -> np.ndarray:
-    """Invert all bits of negative int16 numbers except the sign; the inverse of itself."""
+    """Invert all bits of negative int16 numbers except the sign. The function is its own inverse."""
     return bits ^ ((bits >> 15) & 0x7FFF)
 
 
@@ -253,7 +253,7 @@ def read_npy(path: Path, description: str) -> np.ndarray:
     if not os.path.isfile(path):
         if os.path.lexists(path):
             raise InputError(f"{description} {path} is not a file; expected an NPY file as written by numpy.save")
-        raise FileNotFoundError(f"{description} {path} does not exist; check the folder")
+        raise FileNotFoundError(f"{description} {path} does not exist; check the path")
     try:
         with open_regular(path) as file:
             _check_npy(file)
@@ -268,7 +268,7 @@ def read_npy_bytes(data: bytes) -> np.ndarray:
     """Return the numeric array in the bytes of an NPY file, in native byte order.
 
     Raises:
-        ValueError: As for `read_npy`.
+        ValueError: The bytes are not a valid NPY file; see `read_npy`.
     """
     _check_npy(io.BytesIO(data))
     values = np.load(io.BytesIO(data), allow_pickle=False)
@@ -283,11 +283,11 @@ def _check_npy(file: IO[bytes]) -> None:
         raise InputError(f"its NPY header cannot be read: {type(error).__name__}") from None
     if dtype.kind not in _NUMERIC_KINDS or dtype.itemsize > 8:
         kind = "objects" if dtype.hasobject else str(dtype)[:80]
-        raise InputError(f"it contains {kind}, expected integers or floats of at most 64 bits")
+        raise InputError(f"it contains {kind}, expected booleans, integers or floats of at most 64 bits")
     if len(shape) > 8 or min(shape, default=0) < 0 or math.prod(length or 1 for length in shape) > _MAX_NUMBERS:
-        raise InputError("the shape in its header has more than 8 dimensions, or negative or too large ones")
+        raise InputError("its header declares more than 8 dimensions, a negative dimension, or too many numbers")
     start, expected = file.tell(), math.prod(shape) * dtype.itemsize
     found = file.seek(0, os.SEEK_END) - start
     if expected != found:
         lengths = " x ".join(map(str, shape))
-        raise InputError(f"{lengths[:80]} {dtype} needs {expected:,} bytes, found {found:,}")
+        raise InputError(f"{lengths[:80]} numbers of type {dtype} need {expected:,} bytes, but the file has {found:,}")

@@ -44,7 +44,7 @@ def text_digest(text: str) -> str:
 
 
 def file_digest(*files: Path, compare_to: str = "") -> str:
-    """Return the digest of the concatenated contents of files. Their paths have no influence.
+    """Return the digest of the concatenated contents of files. It does not depend on their paths.
 
     One core hashes about 10 GB/s.
 
@@ -239,7 +239,7 @@ def _read(journal: Path) -> dict[str, Any] | None:
 
 
 def _signature(temporary: Path, text: str) -> str:
-    """Return the signature of the text of a journal and its folder, so that moving a journal invalidates it."""
+    """Sign the text of a journal together with the path of its folder, so that a moved journal is not valid."""
     message = f"{temporary.resolve()}\n{text}".encode("utf8", "surrogateescape")
     return hmac.new(_key(), message, "sha256").hexdigest()
 
@@ -358,7 +358,7 @@ def draft_directory(path: Path) -> Iterator[Path]:
 
 
 def commit_directory(draft: Path, path: Path, *, replaced: Callable[[Path], Collection[str]] | None = None) -> bool:
-    """Rename a folder of `draft_directory` to its final path; return False if that path exists and `replaced` is None.
+    """Rename a folder from `draft_directory` to its final path; return False if the path exists and `replaced` is None.
 
     The system exchanges an existing folder with the new one, so the path exists at every instant. If the system cannot
     exchange folders, a journal records the steps. The next command that opens or writes the run then completes them.
@@ -404,7 +404,7 @@ def _link_others(old: Path, new: Path, replaced: Collection[str], *, keep_new: b
                 continue
             if os.path.lexists(file):
                 raise InputError(
-                    f"{source / name} is not a file of the old lift, but the new one writes it; move it elsewhere"
+                    f"the new lift would replace {source / name}, which the old lift did not write; move it elsewhere"
                 )
             try:
                 os.link(source / name, file, follow_symlinks=False)
@@ -436,7 +436,7 @@ def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, rem
 
 
 def complete_interrupted_writes(folder: Path) -> None:
-    """Complete the interrupted replacements in a folder, and delete the temporary folders of dead processes."""
+    """Complete the interrupted replacements in a folder, and delete the temporary folders of ended processes."""
     for temporary in folder.glob(f"{_TEMPORARY_PREFIX}*"):
         if _TEMPORARY_NAME.fullmatch(temporary.name) is None or temporary.is_symlink():
             continue
@@ -495,7 +495,7 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
             names = ", ".join(map(str, paths))
             blocked = isinstance(error, IsADirectoryError | NotADirectoryError | FileExistsError)
             remedy = "delete the file or folder at this path" if blocked else "free disk space or choose another folder"
-            reason = f"{names} cannot be written ({reason}); {remedy}, then run again"
+            reason = f"{names} cannot be written ({reason}); {remedy}, then run the command again"
         raise NotWrittenError(reason) from error
     finally:
         for place in new_folders:
@@ -568,9 +568,9 @@ def refuse_existing(*paths: Path, overwrite: bool, flags: str) -> None:
 
 
 def safe_file_name(text: str) -> str:
-    """Return the first 40 characters of a string for use in a file name; only letters and digits are kept.
+    """Return the first 40 characters of a string for use in a file name.
 
-    Each other character becomes `_`.
+    Each character except letters and digits becomes `_`.
 
     >>> safe_file_name("../tea pot")
     '___tea_pot'

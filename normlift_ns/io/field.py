@@ -1,4 +1,4 @@
-"""Readers for the files of a semantic field, which check digests, shapes, index ranges and finite values.
+"""Read the files of a semantic field, and check their digests, shapes, index ranges and finite values.
 
 This module does not need torch.
 """
@@ -39,8 +39,8 @@ class RowArrays(NamedTuple):
             name: Name of the matrix, for the error message.
             num_columns: Number of columns of the matrix.
         Raises:
-            ValueError: An array has the wrong type or shape, a column is out of range, or a weight is negative or not
-                finite.
+            ValueError: An array has the wrong type or shape, the offsets are not valid, a column is out of range, or a
+                weight is negative or not finite.
         """
         weight_dtype = "float64" if self.weight.dtype == "float64" else "float32"
         arrays = (("offsets", self.offsets, "int64"), ("columns", self.column, "int32"))
@@ -51,8 +51,8 @@ class RowArrays(NamedTuple):
         size = self.column.size
         if ends != [0, size] or self.weight.size != size or bool((self.offsets[1:] < self.offsets[:-1]).any()):
             raise InputError(
-                f"{name}: offsets must not decrease, from 0 to the number of entries. The first and last are {ends}, "
-                f"for {size} columns and {self.weight.size} weights."
+                f"{name}: offsets must begin with 0, never decrease, and end with the number of entries. The first and "
+                f"last are {ends}, for {size} columns and {self.weight.size} weights."
             )
         low, high = (int(self.column.min()), int(self.column.max())) if size > 0 else (0, -1)
         if low < 0 or high >= num_columns:
@@ -79,9 +79,9 @@ class FieldArrays(NamedTuple):
 
     manifest: dict[str, Any]
     arrays: dict[str, np.ndarray]
-    """Arrays by name: `source`, the scalars, and `means` (since version 0.2).
+    """Arrays by name: `source`, the scalars, `means` (since version 0.2), and `null_level` if the lift computed it.
 
-    Fields that store evidence also have `features`. Other fields have `coordinates`, and `basis` if it is low-rank.
+    Fields that store evidence also have `features`. Other fields have `coordinates`; low-rank fields also have `basis`.
     """
     evidence: EvidenceArrays | None
     """Evidence; None for the other storage forms."""

@@ -40,7 +40,7 @@ class ClaimState(NamedTuple):
     number: int
     """Number of the latest attempt; 0 if no process has claimed the task yet."""
     outcome: str | None
-    """Outcome of that attempt; None while it runs, or if its owner died."""
+    """Outcome of that attempt; None while the attempt runs, or if its owner died."""
 
 
 UNCLAIMED = ClaimState(0, None)

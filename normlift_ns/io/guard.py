@@ -48,7 +48,7 @@ def _open_at_once(path: str, flags: int) -> int:
 
 
 def check_regular(path: str | Path, *, max_bytes: int | None = None) -> None:
-    """Raise the errors of `open_regular`, before another library opens the file."""
+    """Raise the errors of `open_regular` if a path is not a regular file that another library may open."""
     open_regular(path, max_bytes=max_bytes).close()
 
 
@@ -94,7 +94,7 @@ def protect_inputs(*paths: Path | None) -> None:
 
 
 def forget_inputs() -> None:
-    """Remove the protection of `protect_inputs`, at the beginning of a command."""
+    """Remove all protections of `protect_inputs`. Each command calls this function when it starts."""
     _inputs.clear()
 
 
@@ -125,7 +125,7 @@ def refuse_inputs(paths: Iterable[Path], *, instead: str = "path") -> None:
 def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callable[[], Mapping[Any, str]]) -> str | None:
     """Return a description of the input, run, data set or cache that contains a path; None if it may be written.
 
-    The path must have its links resolved.
+    Links in the path must already be resolved.
     """
     exists, folder = os.path.exists(path), os.path.dirname(path)
     for kind, parent, names in owners(folder):
@@ -184,7 +184,7 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=Tru
 def file_kind(path: Path) -> str:
     """Return the kind of a file by its content: a suffix such as ".ply", or "" for an empty file.
 
-    For kinds without a suffix here, return a description with the first column or the first bytes.
+    For other kinds, return a description, for instance with the first column of a table or the first bytes.
 
     Raises:
         OSError, ValueError: The file cannot be read, or is not a regular file.

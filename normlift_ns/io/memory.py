@@ -1,4 +1,4 @@
-"""Limits of the memory that this process may still allocate: the machine, its cgroups and `ulimit -v`."""
+"""Memory that this process may still allocate, as limited by the machine, its cgroups and `ulimit -v`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 _LIFT_BYTES, _GAUSSIAN_BYTES, _PIXEL_BYTES = 2**29, 600, 32
 """Lower bounds for the memory of a lift, in bytes: fixed, per Gaussian, and per pixel of a view.
 
-The bytes of a Gaussian are its parameters, their copy in the new run, and its scalars.
+The bytes per Gaussian are for its parameters, their copy in the new run, and its scalars.
 """
 
 
@@ -99,7 +99,7 @@ def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = T
 
 
 def _library_bytes() -> int:
-    """Return the total size of the libraries of torch and CUDA in bytes; a process maps all of it into memory."""
+    """Return the total size in bytes of the libraries of torch and CUDA, which a process maps into memory."""
     spec = find_spec("torch")
     places = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
     files = [file for place in places for file in (*place.glob("lib/*.so*"), *place.parent.glob("nvidia/*/lib/*.so*"))]

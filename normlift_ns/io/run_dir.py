@@ -29,9 +29,9 @@ FIELD_FOLDER = "normlift"
 TEXT_EMBEDDINGS_FILE = "texts.npz"
 """Name of the file in the field folder that stores the user's prompts with their embeddings."""
 _MAX_NAME_BYTES = 200
-"""Maximum length of a folder name in bytes. Systems allow 255; the others are reserved for appended numbers."""
+"""Maximum length of a folder name in bytes. Systems allow 255 bytes; the rest is reserved for appended numbers."""
 _SEAL = "# Lines below: "
-"""Beginning of a config.yml that normlift_ns wrote. The digest of all lines after the first follows it."""
+"""Beginning of a config.yml that normlift_ns wrote. After it comes the digest of all lines except the first."""
 _WRITTEN = (
     *("field.safetensors", "evidence.safetensors", TEXT_EMBEDDINGS_FILE, "../dataparser_transforms.json"),
     *("../splat.json", "../transforms.json", "../added_photographs.json"),
@@ -41,9 +41,12 @@ SCHEMA_VERSION = 1
 MANIFEST_FILE = "manifest.json"
 LIFT_AGAIN = "lift again with: ns-normlift --load-config ..."
 DIGESTED_PATH = re.compile(r"(\.\./(nerfstudio_models/)?)?\w[\w.-]*")
-"""Pattern of the paths of files with digests, relative to the manifest. They are next to it or part of its run."""
+"""Pattern of the paths of files with digests, relative to the folder of the manifest.
+
+The files are in this folder, in the run directory or in nerfstudio_models/.
+"""
 _LARGE = 2**32
-"""Size in bytes above which the end of a checkpoint is checked before its digest is computed, which takes seconds."""
+"""Size of a checkpoint in bytes above which its end is checked first, because computing its digest takes seconds."""
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 
 
@@ -151,7 +154,7 @@ def run_file_digests(folder: Path, files: Iterable[Path]) -> dict[str, str]:
 
 
 def add_digest_comment(config: str) -> str:
-    """Return the text of a config.yml after a comment with its digest, which later reveals edits."""
+    """Return the text of a config.yml after a comment with its digest, by which later edits are detected."""
     return f"{_SEAL}{text_digest(config)} (to change them without a warning, delete this line)\n{config}"
 
 
@@ -189,7 +192,7 @@ def written_files(run_dir: Path) -> set[str]:
     """Return the paths of the files that a lift wrote, relative to the run directory.
 
     They are config.yml, the manifest, the stored queries, and the files in the manifest. If the manifest is damaged or
-    from version 0.1, the default names of all files that a lift writes replace its list.
+    from version 0.1, the default names of all files that a lift writes are used instead of its list.
     """
     names = {"config.yml", *(f"{FIELD_FOLDER}/{name}" for name in (MANIFEST_FILE, "queries.safetensors"))}
     try:
@@ -219,7 +222,9 @@ class _Metadata(msgspec.Struct):
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
-    """Write a manifest: metadata, digests of files, and a digest of its own text with an empty value for that digest.
+    """Write a manifest of metadata, digests of files, and a digest of its own text.
+
+    The digest of the text is computed while its own value in the text is empty.
 
     Args:
         facts: Metadata of JSON types.
@@ -267,7 +272,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
         msgspec.convert(facts, _Metadata)
         digests = None if digests is None else msgspec.convert(digests, dict[str, str])
         if outside := [name for name in digests or () if DIGESTED_PATH.fullmatch(name) is None]:
-            raise InputError(f"it has a digest of {outside[0]!r}, expected only files of the run")
+            raise InputError(f"it has a digest of {outside[0]!r}, which is not a file of the run")
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is damaged ({error}); {LIFT_AGAIN}") from error
     return facts | _new_names(facts), digests
@@ -282,7 +287,7 @@ def _new_names(facts: Mapping[str, Any]) -> dict[str, Any]:
 def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapping[str, str] | None) -> None:
     """Raise if a manifest and the files next to it are from different lifts.
 
-    If nothing has a digest, as in version 0.1, only warn.
+    If neither the manifest nor any file has a digest, as in version 0.1, only warn.
 
     Args:
         actual: Digests of the files by name; None for files without a digest.
@@ -300,8 +305,8 @@ def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapp
         wanted = None if expected is None else expected.get(name)
         if digest is None or digest != wanted:
             raise InputError(
-                f"{folder / name} and its manifest are from different lifts: the file has digest {digest}, the "
-                f"manifest {wanted}; {LIFT_AGAIN}"
+                f"{folder / name} and its manifest are from different lifts: the file has digest {digest}, but the "
+                f"manifest has {wanted}; {LIFT_AGAIN}"
             )
 
 

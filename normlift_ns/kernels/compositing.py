@@ -25,7 +25,10 @@ _ROUNDING = tl.constexpr(2.0**-20)
 _REACH_MARGIN = tl.constexpr(1e-3)
 """Margin of the largest relevant exponent, for rounding of the exponential and of the float64 computation here."""
 _NEEDLE = tl.constexpr(1e-6)
-"""Ratio of a determinant to the product of its diagonal below which it is too inaccurate to cull a splat."""
+"""Limit for the ratio of a determinant to the product of its diagonal.
+
+Below this limit, the determinant is too inaccurate to cull a splat.
+"""
 _FAR = tl.constexpr(1e30)
 _SIZES = ("width", "height", "tiles_across", "tiles_down", "cells_across", "cells_down")
 """Arguments of kernels that are compiled once for images of all sizes."""
@@ -155,7 +158,7 @@ def build_cell_lists(
         views: Number of views.
         grid: Cells of an image.
         min_alpha: Smallest alpha that is drawn.
-        cull: Omit splats from cells in which their alpha is below `min_alpha`. Other entries do not depend on it.
+        cull: Omit splats from cells in which their alpha is below `min_alpha`. This does not change other entries.
     """
     device, entries, tile = projected.depth.device, len(projected.depth), grid.tile
     order = projected.depth.sort(stable=True).indices  # equal depths keep the order of the Gaussians
@@ -218,7 +221,7 @@ class RegionSums(NamedTuple):
     """Nonzero sums for every cell, splat and region, ordered by cell. A key can occur in several cells."""
 
     key: Int[Tensor, " m"]
-    """Keys row * columns + label + 1, with row the row of the splat."""
+    """Keys row * columns + label + 1, in which row is the row of the splat."""
     weight: Float32[Tensor, " m"]
 
 
@@ -240,8 +243,8 @@ def _unpack_floats(pair):
 def load_splat(splats, m, valid, IS_2D: tl.constexpr):
     """Return u, v, opacity and nine numbers of the shape of a splat; an invalid splat has opacity 0.
 
-    The nine numbers are the transform of a 2D Gaussian. A conic has three, half of xx, half of yy, and xy; the last one
-    is repeated.
+    For a 2D Gaussian, the nine numbers are its transform. For a 3D Gaussian, the first three are half of xx, half of yy
+    and xy of its conic, and the others repeat xy.
     """
     row = splats + (8 if IS_2D else 4) * m.to(tl.int64)
     u, v = _unpack_floats(tl.load(row, mask=valid, other=0))
@@ -280,7 +283,7 @@ def _exponent_2d(u, v, u0, u1, u2, v0, v1, v2, w0, w1, w2, px, py):
 def blend(
     u, v, opacity, a, b, c, d, e, f, g, h, i, px, py, T, max_alpha, min_alpha, min_transmittance, IS_2D: tl.constexpr
 ):  # fmt: skip
-    """Return (A_ij, transmittance after it) of one splat in all pixels; a finished pixel has transmittance 0."""
+    """Return A_ij of one splat and the transmittance behind the splat in all pixels; 0 for finished pixels."""
     sigma = _exponent(u, v, a, b, c, px, py)
     if IS_2D:
         sigma = _exponent_2d(u, v, a, b, c, d, e, f, g, h, i, px, py)
@@ -297,7 +300,8 @@ def _number_labels(
 ):
     """Number the labels >= -1 of a cell in ascending order.
 
-    The numbers are written to local[cell, pixel], or -1 for other labels, and the labels to table[cell, number].
+    The kernel writes the number of each pixel's label to local[cell, pixel], or -1 for other labels. It writes the
+    labels to table[cell, number].
     """
     cell = tl.program_id(0).to(tl.int64)
     view = cell // cells

@@ -2,8 +2,8 @@
 
 A warp searches for the neighbors of all points of a leaf together. It visits the tree from this leaf outward, and skips
 a subtree if its box is farther than the worst candidate of every point. It keeps a few more candidates than requested,
-by float32 distance, and finally ranks them by float64 distance and index. The result is certified. If a dropped point
-could be as near as the last neighbor, the row is reported as uncertain.
+by float32 distance, and finally ranks them by float64 distance and index. If a dropped point could be as near as the
+last neighbor, the row is reported as uncertain.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _PAIRS = 2**24
 _SORTED_IN_A_BLOCK = 4096
 """Largest number of points that torch sorts within one GPU block, without passes over memory."""
 _LEAVES = 2**14
-"""Number of leaves per launch, which is half a million points of 320 bytes each for K = 36."""
+"""Number of leaves per launch. They contain half a million points, of 320 bytes each for K = 36."""
 
 
 class GatheringProcesses(Protocol):
@@ -69,7 +69,7 @@ class NearestNeighbors(NamedTuple):
     spacing: Float64[Tensor, " n"]
     """Distance to the nearest candidate at another position, or inf if there is none."""
     certain: Bool[Tensor, " n"]
-    """False if the result may be wrong."""
+    """False for points whose neighbors may be wrong."""
 
 
 def build_kd_tree(points: Float32[Tensor, "n 3"], communicator: GatheringProcesses | None = None) -> KdTree:
@@ -135,7 +135,7 @@ def _box(nodes: Float32[Tensor, "nodes m 3"]) -> tuple[Float32[Tensor, "nodes 3"
 
 
 def _ascending_bits(x: Tensor) -> Tensor:
-    """Return int32 numbers that have the same order as the float32 numbers."""
+    """Return int32 numbers that have the same order as the given float32 numbers."""
     bits = (x + 0.0).view(torch.int32)  # + 0.0 replaces -0.0
     return torch.where(bits < 0, -(bits & 0x7FFFFFFF), bits)
 
@@ -294,7 +294,10 @@ def find_nearest(
 
 
 def brute_force_nearest(points: Float32[Tensor, "n 3"], rows: Int64[Tensor, " r"], k: int) -> NearestNeighbors:
-    """Return the K nearest other points of some points from all distances, for uncertain rows of `find_nearest`."""
+    """Return the K nearest other points of some points by computing all distances.
+
+    This function serves the uncertain rows of `find_nearest`.
+    """
     exact, parts = points.double(), []
     n = len(points)
     for chunk in rows.split(max(1, _PAIRS // n)):

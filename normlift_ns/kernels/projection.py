@@ -1,7 +1,7 @@
 """Projection of Gaussians into cameras as in gsplat, with one thread per Gaussian.
 
 The arithmetic is that of gsplat 1.4.0's fully_fused_projection_fwd.cu as nvcc 13.0 compiles it for sm_90 with gsplat's
-flags (-O3 --use_fast_math). The code rounds and fuses the same products as this machine code. Other fused
+flags (-O3 --use_fast_math). The code rounds and fuses the same products as that machine code. Other fused
 operations are disabled. Divisions, square roots and reciprocals are the approximate versions of both compilers. All
 numbers are therefore equal bit for bit, except numbers below 2 ** -126.
 """
@@ -17,12 +17,12 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 CAMERA = 16
-"""Number of values per camera, which are the rows (r, r, r, t) of its pose, fx, fy, cx and cy."""
+"""Number of values per camera: three rows (r, r, r, t) of its pose, then fx, fy, cx and cy."""
 SPLAT = 8
 """Number of values per splat, which are read as four pairs.
 
-The values are the center u, v in pixels, then half of xx, half of yy, and xy of the inverse covariance. The last ones
-are the opacity, and half width and half height of the rectangle in pixels.
+The values are the center u, v in pixels, then half of xx, half of yy, and xy of the inverse covariance. The last values
+are the opacity, and the half width and half height of the rectangle in pixels.
 """
 _BLOCK = 128
 _ENORMOUS = tl.constexpr(2.0**60)
@@ -250,10 +250,10 @@ def project_gaussians(
     """Project a scene into cameras of one size. Invisible Gaussians take only one byte per view.
 
     Args:
-        means: Centers of the Gaussians.
-        quats: Rotations.
-        scales: Standard deviations.
-        opacities: Opacities.
+        means: Centers of the Gaussians in world coordinates.
+        quats: Rotations as quaternions (w, x, y, z) of any length above 0.
+        scales: Standard deviations in world units.
+        opacities: Opacities in 0..1.
         drawable: Mask of the Gaussians to project.
         cameras: Values of every camera, as described at `CAMERA`.
         width: Width of the images in pixels.

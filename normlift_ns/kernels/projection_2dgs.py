@@ -23,7 +23,7 @@ of the transform follow. See `rasterization.projection.ProjectedGaussians2D`.
 """
 _BLOCK = 128
 _LEAST_EXTENT = tl.constexpr(1e-4)
-"""Least square of the half side of an ellipse of one standard deviation, in square pixels."""
+"""Lower bound for the squared half side of an ellipse of one standard deviation, in square pixels."""
 _LARGEST_RADIUS = tl.constexpr(2147483648.0)
 
 
@@ -62,7 +62,7 @@ def _rotated(camera, axis: tl.constexpr, ax, ay, az, bx, by, bz):
 
 @triton.jit
 def _along_axis(last_a, last_b, last_c, a, b, c, inverse):
-    """Return center and squared half side of the projected ellipse along one axis of the image."""
+    """Return the center and the squared half side of the projected ellipse along one axis of the image."""
     scaled_a, scaled_b, scaled_c = a * inverse, b * inverse, -(c * inverse)
     center = tl.fma(last_c, scaled_c, tl.fma(last_a, scaled_a, last_b * scaled_b))
     square = tl.fma(c, scaled_c, tl.fma(a, scaled_a, b * scaled_b))
@@ -75,7 +75,7 @@ def _project(
     width, height, near_plane, far_plane, radius_sigmas, min_alpha,
     WRITE: tl.constexpr, CAMERA: tl.constexpr, SPLAT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Mark the visible pairs of a Gaussian and a camera; or write the splats of the pairs in `keys`."""
+    """Mark the visible pairs of a Gaussian and a camera, or write the splats of the pairs in `keys`."""
     e = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = e < count
     key = e
@@ -145,10 +145,10 @@ def project_gaussians_2d(
     """Project a scene of 2D Gaussian Splatting into cameras of one size. Invisible Gaussians take one byte per view.
 
     Args:
-        means: Centers of the Gaussians.
-        quats: Rotations.
-        scales: Standard deviations; the third one is not used.
-        opacities: Opacities.
+        means: Centers of the Gaussians in world coordinates.
+        quats: Rotations as quaternions (w, x, y, z) of any length above 0.
+        scales: Standard deviations in world units; the third one is not used.
+        opacities: Opacities in 0..1.
         drawable: Mask of the Gaussians to project.
         cameras: Values described at `CAMERA`.
         width: Width of the images in pixels.

@@ -31,7 +31,7 @@ def _measure(
     logits, row_first, row_weights, column_first, column_weights, out, height, width, low_height, low_width, offset,
     ROWS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the pixel counts above offset and -offset, and x0, y0, x1, y1 of some rows to out[mask, part]."""
+    """Write the pixel counts above offset and -offset, and the box x0, y0, x1, y1, of some rows to out[mask, part]."""
     mask = tl.program_id(0).to(tl.int64)
     mask_logits = logits + mask * low_height * low_width
     x = tl.arange(0, BLOCK)
@@ -111,7 +111,7 @@ def measure_masks(
     return *partial[:, :, :2].sum(dim=1, dtype=torch.int32).unbind(dim=1), boxes
 
 
-# Final steps of SAM's mask decoder in one pass, which are two transposed convolutions and products with mask channels.
+# Final steps of SAM's mask decoder in one pass: two transposed convolutions, then products with mask channels.
 #
 # In separate steps, the channels of all pixels would take many times the memory of the image and the masks. Here, they
 # stay in registers, in float32 except as input of tensor cores.

@@ -68,7 +68,10 @@ def multiply_vector(
     weight: Float[Tensor, " nnz"],
     vector: Float[Tensor, " s"],
 ) -> Float[Tensor, " n"]:
-    """Return E x in the precision of x, summed in float64. The kernel is fast for many short rows."""
+    """Return the product E x of a sparse matrix and a vector, in the precision of x but summed in float64.
+
+    The kernel is fast for many short rows.
+    """
     out = torch.empty(len(offsets) - 1, dtype=vector.dtype, device=vector.device)
     grid = (triton.cdiv(len(out), _ROWS),)
     _product[grid](offsets, column, weight, vector, out, len(out), ROWS=_ROWS, num_warps=4)
@@ -168,12 +171,12 @@ def row_norms(
     """Return the norms that the lift needs, in one pass over E and without an [N, D] array.
 
     Args:
-        offsets: Row offsets of E.
+        offsets: Row offsets of the sparse matrix E.
         column: Columns of the entries, ascending in each row. Entries of a view are therefore consecutive.
         weight: Weights of the entries.
         column_view: View of every column, non-decreasing.
         table: Unit rows F.
-        min_share: Norm of a sum, as a share of its weight, below which it is repeated in float64.
+        min_share: Ratio of the norm of a sum to its weight below which the sum is repeated in float64.
         max_entries: Number of entries above which a sum is repeated in float64.
     """
     n, dimension, device = len(offsets) - 1, table.shape[1], table.device
@@ -227,7 +230,7 @@ def unit_sums(
 
     Args:
         rows: Indices of the rows j.
-        offsets: Row offsets of E.
+        offsets: Row offsets of the sparse matrix E.
         column: Columns of the entries.
         weight: Weights of the entries.
         table: Unit rows F.

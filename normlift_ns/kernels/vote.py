@@ -3,12 +3,12 @@
 Float32 rows u are split into u = h + l, with 11 bits each. Three products at the fastest rate of tensor cores,
 h h + h l + l h, give cosines with 22 bits. Most votes need only the first product.
 
-Let e be the largest |l| in the group. Assume that all products and sums are exact except for roundings of 2**-23
-relative to at most 1. Then |<h_j, h_k> - <u_j, u_k>| <= t with t = 2.02 e + (D + 16) 2**-23. The derivative of
-log(g (1 - g)) by the cosine is at most 1 / gamma. Let f = exp(t / gamma) - 1. An error t of the cosine then changes
-a sigmoid g by at most f g (1 - g). Let A be the sum of g with weights of sum W. By Jensen's inequality, its error
-is at most f A (1 - A / W). The rounding of sums adds at most 3e-5. If these error intervals determine the winner, it is
-the result. Otherwise, the vote adds the remaining products and compares again.
+Let e be the largest |l| in the group. Assume that all products and sums are exact except for rounding errors of 2**-23
+relative to values of at most 1. Then |<h_j, h_k> - <u_j, u_k>| <= t with t = 2.02 e + (D + 16) 2**-23. The derivative
+of log(g (1 - g)) with respect to the cosine is at most 1 / gamma. Let f = exp(t / gamma) - 1. An error t of the cosine
+then changes a sigmoid g by at most f g (1 - g). Let A be the weighted sum of g, and W the sum of the weights. By
+Jensen's inequality, the error of A is at most f A (1 - A / W). The rounding of sums adds at most 3e-5. If these error
+intervals determine the winner, the vote is finished. Otherwise, it adds the remaining products and compares again.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ def vote(
         directions: Unit rows or 0. Tensor cores multiply them and sum in float32.
         row_of: Row of every Gaussian's direction, valid for the voters and their neighbors.
         reliability: Reliability of every Gaussian.
-        source: Output.
+        source: Output. Entries of other Gaussians are not changed.
         tau: Threshold of the sigmoid.
         gamma: Width of the sigmoid.
         width: sigma_d, in the units of `distance`.
@@ -192,9 +192,9 @@ def vote(
         own: Number of views that agree on each Gaussian's own direction, or None for the paper's vote.
         prior: Weight of the neighbors in a posterior vote, as a number of views.
         precision: Precision of the products of float32 directions. "halves" uses two halves of 11 bits each.
-            "certified" has the same winners, but uses only the first halves if these determine the winner. "first"
-            writes only winners that the first halves determine. "tf32" rounds to 11 bits, "tf32x3" uses three such
-            parts, and "ieee" does not round. Directions in half precision are not rounded.
+            "certified" gives the same winners, but uses only the first halves if these determine the winner. "first"
+            writes only winners that the first halves determine. "tf32" rounds to 11 bits, "tf32x3" adds three such
+            products, and "ieee" does not round. Directions in half precision are not rounded.
     """
     if len(voters) == 0:
         return

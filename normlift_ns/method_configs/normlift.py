@@ -31,12 +31,12 @@ def trainer_config(
     image_scale: float = 1.0,
     **optimizers: Any,
 ) -> TrainerConfig:
-    """Return splatfacto's trainer config with a lift at the end. The viewer only listens on 127.0.0.1.
+    """Return splatfacto's trainer config with a lift at the end. The viewer listens on 127.0.0.1 only.
 
     Args:
-        source: options of the 2D features (default: those of ns-normlift).
-        image_scale: size of the training images relative to the files.
-        optimizers: replacements of splatfacto's optimizers, by parameter name.
+        source: Options of the 2D features (default: those of ns-normlift).
+        image_scale: Size of the training images relative to the files.
+        optimizers: Replacements for splatfacto's optimizers, by parameter name.
     """
     return TrainerConfig(
         method_name=method_name,

@@ -1,4 +1,4 @@
-"""splatfacto model with a semantic field, and an LPIPS metric that loads its weights at the first use."""
+"""splatfacto model with a semantic field, and an LPIPS metric that loads its weights on first use."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from normlift_ns.rendering.figures import Display, render_outputs
 
 
 class LazyLpips(torch.nn.Module):
-    """Replacement of torchmetrics' LearnedPerceptualImagePatchSimilarity that downloads weights at the first use.
+    """Replacement for torchmetrics' LearnedPerceptualImagePatchSimilarity that downloads weights on first use.
 
     Args:
-        options: keyword arguments of the metric.
+        options: Keyword arguments of the metric.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -89,7 +89,7 @@ class NormLiftModel(SplatfactoModel):
     def populate_modules(self) -> None:
         """Set up splatfacto's modules without CUDA and without downloads, and add the viewer panel."""
         if not torch.cuda.is_available():  # splatfacto moves the colors of seed points to CUDA
-            # without seed points, splatfacto would search neighbors of 50,000 random points, so pass four points
+            # without seed points, splatfacto would search for neighbors of 50,000 random points, so pass four points
             seeds = torch.arange(12.0).view(4, 3), torch.zeros(0, 3)
             self.seed_points = None if self.config.semantics is None else seeds  # until the checkpoint is loaded
         # the stock metric downloads AlexNet
@@ -114,7 +114,7 @@ class NormLiftModel(SplatfactoModel):
         """Load a splatfacto or normlift checkpoint, and then the semantic field of the config.
 
         Raises:
-            FileNotFoundError, ValueError: if the field is missing, is damaged, or belongs to other Gaussians.
+            FileNotFoundError, ValueError: If the field is missing, is damaged, or belongs to other Gaussians.
         """
         super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
         if self.config.semantics is not None:
@@ -140,11 +140,11 @@ class NormLiftModel(SplatfactoModel):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Return the stock outputs (rgb, depth, accumulation, background), and with a field also `render_outputs`.
+        """Return the stock outputs (rgb, depth, accumulation, background), and those of `render_outputs` for a display.
 
         Args:
-            camera: one camera. An invalid camera from nerfstudio's viewer is replaced by a similar valid one.
-            obb_box: crop box. Gaussians outside it are not drawn.
+            camera: One camera. An invalid camera from nerfstudio's viewer is replaced by a similar valid one.
+            obb_box: Crop box. Gaussians outside it are not drawn.
         """
         display, (camera, view) = self._display, _valid_camera(camera.to(self.device))
         rows = self.drawn_mask(obb_box, display)
@@ -242,7 +242,7 @@ def find_field_folder(semantics: Path) -> Path:
     config to models. It is therefore read from the call stack.
 
     Args:
-        semantics: folder in the config, which is returned if there is no folder next to config.yml.
+        semantics: Folder in the config, which is returned if there is no folder next to config.yml.
     """
     frame = inspect.currentframe()
     while frame is not None:

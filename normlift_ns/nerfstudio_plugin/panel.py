@@ -30,7 +30,7 @@ from normlift_ns.errors import InputError, describe_error
 from normlift_ns.exports import MIN_OPACITY_LOGIT
 from normlift_ns.io.run_dir import cache_folder, text_cache_folder
 from normlift_ns.query.engine import Answer
-from normlift_ns.query.question import Query, load_query
+from normlift_ns.query.question import Query, join_prompts, load_query, split_prompts
 from normlift_ns.query.text_encoder import default_rule, text_encoder_for
 from normlift_ns.rendering.colors import COLORMAPS, Colormap, clip_text
 from normlift_ns.rendering.figures import Display, make_display, output_names
@@ -38,7 +38,7 @@ from normlift_ns.session import actions
 from normlift_ns.session.actions import MAX_GROW_STEPS, MAX_THRESHOLD, MIN_THRESHOLD
 from normlift_ns.session.objects import ObjectRow, list_objects, unoccluded_viewpoint
 from normlift_ns.session.outputs import splat_bytes, store_query
-from normlift_ns.session.prompts import join_prompts, prompts_of_query, split_prompts
+from normlift_ns.session.prompts import prompts_of_query
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
 from normlift_ns.viewer.adapter import KEYS_SCRIPT, handle_in_order, ignore_closed_clients, send_in_order
@@ -64,7 +64,7 @@ class ClickListener:
     """Listener for a click on the scene in one browser.
 
     Args:
-        hit: callback with the action of the click, and the origin and direction of its ray in scene units.
+        hit: Callback with the action of the click, and the origin and direction of its ray in scene units.
     """
 
     def __init__(self, hit: Callable[[Action, Tensor, Tensor], None]) -> None:
@@ -77,7 +77,7 @@ class ClickListener:
         return self._armed is not None
 
     def arm(self, action: Action, client: Any) -> None:
-        """Expect a click in one browser, and no longer in another one."""
+        """Expect a click in one browser, and stop expecting one in any other browser."""
         self.disarm()
         client.scene.on_pointer_event("click")(self._clicked)
         self._armed = (action, client)
@@ -111,7 +111,7 @@ def visible_mask(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, " n"]:
     """Return the mask of Gaussians that are opaque enough to be drawn.
 
     Args:
-        opacities: logits.
+        opacities: Logits.
     """
     return opacities.detach()[:, 0] >= MIN_OPACITY_LOGIT
 
@@ -120,8 +120,8 @@ def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"])
     """Return the status as MDX, with the running work, message, size of the selection, remarks on it, and warnings.
 
     Args:
-        busy: description of the running work, or an empty string.
-        drawn: mask of Gaussians from `visible_mask`.
+        busy: Description of the running work, or an empty string.
+        drawn: Mask of Gaussians from `visible_mask`.
     """
     lines = [escape_mdx(text) for text in (busy, clip_text(message, 400)) if text]
     selection = state.selection
@@ -173,8 +173,8 @@ class PanelWidgets(ActionWidgets):
         super().__init__(gui, act, lock)
         with add_first_tab(gui, TAB_LABEL, "SEARCH"):
             self.prompts = gui.add_text("Prompts", "", hint="Objects to search for, separated by commas.")
-            self.ask = self._button(Action.ASK, hint="Search for the prompts (Enter in the text field).")
-            self.cancel = self._button(Action.CANCEL, hint="Cancel the query or the pending click (Escape).")
+            self.ask = self._button(Action.ASK, hint="Search for the prompts (or press Enter in the text field).")
+            self.cancel = self._button(Action.CANCEL, hint="Cancel the query or the pending click (or press Escape).")
             self.cancel.visible = False
             self.status = gui.add_markdown("")
             self.remove_weak = self._button(Action.REMOVE_WEAK)
@@ -202,7 +202,7 @@ class PanelWidgets(ActionWidgets):
                 self.steps = self._slider(Action.GROW, numbers, "Grow (> 0) or shrink (< 0) the selection.")
             with gui.add_folder("Keep"):
                 self._button(Action.DOWNLOAD, hint="Download the selected Gaussians as a PLY file.")
-                self._button(Action.SAVE, hint="Add the prompts to those in the run, which ns-render draws.")
+                self._button(Action.SAVE, hint="Add the prompts to those stored in the run. ns-render draws them.")
                 self.replace = self._button(Action.REPLACE)
                 self.replace.visible = False
             with gui.add_folder("Advanced", expand_by_default=False):
@@ -222,7 +222,7 @@ class PanelWidgets(ActionWidgets):
         """Reset the settings that apply to the next query.
 
         Args:
-            negatives: default negative prompts.
+            negatives: Default negative prompts.
         """
         self.reset_reliability()
         self._reset(Action.REFINED, self.refined, True)
@@ -261,7 +261,8 @@ def explanation_of_run(folder: Path | None, field: SemanticField | None = None) 
     The first explanation opens the run again, with its images.
 
     Args:
-        folder: folder of the semantic field, or None if the run is not stored yet.
+        folder: Folder of the semantic field, or None if the run is not stored yet.
+        field: Semantic field of the run, or None if the run is not stored yet.
     """
 
     @cache
@@ -275,7 +276,7 @@ def explanation_of_run(folder: Path | None, field: SemanticField | None = None) 
 
 
 def move_camera(client: Any, target: ObjectRow, scene: GaussianScene, drawn: Bool[Tensor, " n"]) -> None:
-    """Move the camera of one browser to face an object, from the current side if the view is not blocked."""
+    """Move the camera of one browser to face an object, from the current side if nothing blocks the view there."""
     camera = client.camera
     view = (np.asarray(camera.position) / VISER_SCALE, camera.up_direction, float(camera.fov))
     position = unoccluded_viewpoint(target, scene, drawn, *view)
@@ -318,7 +319,7 @@ class SearchPanel(Controller):
     """Search panel in nerfstudio's viewer.
 
     Args:
-        host: the `NormLiftModel`, untyped because its module imports this one.
+        host: The `NormLiftModel`, untyped because its module imports this one.
     """
 
     reading_message = "Reading the prompts. The first query also loads the text encoder, which takes a while."
@@ -356,7 +357,7 @@ class SearchPanel(Controller):
         """Enable the panel for a field, and show the answer to a query.
 
         Args:
-            folder: folder of the field, or None if prompts cannot be saved.
+            folder: Folder of the field, or None if prompts cannot be saved.
         """
         with self._lock:
             self._folder, state = folder, State(SelectionContext(field, means))
@@ -489,7 +490,7 @@ class SearchPanel(Controller):
             self._offer_to_replace(query is not None)
             raise
         self._offer_to_replace(False)
-        self.show_message(f"Saved. The run now stores {prompts}, which ns-render draws.")
+        self.show_message(f"Saved. The run now stores {prompts} for ns-render to draw.")
 
     def _offer_to_replace(self, visible: bool) -> None:
         if self._widgets is not None:
@@ -554,7 +555,7 @@ class SearchPanel(Controller):
                 output.value = "overlay"
 
     def _follow_outputs(self, control_panel: Any) -> None:
-        """Apply a pending switch to the overlay when the viewer lists it, which is after its first render."""
+        """Apply a pending switch to the overlay as soon as the viewer lists the overlay, after its first render."""
         update = control_panel.update_output_options
 
         def updated(names: list[str]) -> None:

@@ -67,7 +67,7 @@ class NormLiftPipeline(VanillaPipeline):
         """Return splatfacto's callbacks and the lift, after checking the requirements of the lift.
 
         Raises:
-            ValueError, FileNotFoundError: if the encoder or a query cannot be used.
+            ValueError, FileNotFoundError: If the encoder or a query cannot be used.
         """
         callbacks = super().get_training_callbacks(training_callback_attributes)
         trainer, model = training_callback_attributes.trainer, cast(NormLiftModel, self.model)
@@ -89,9 +89,9 @@ def check_before_training(trainer: Trainer) -> None:
     """Raise before training if the lift at its end would fail, and print warnings about the images.
 
     Raises:
-        ValueError, FileNotFoundError: if the lift does not support the scene, an option is out of range, or nerfstudio
+        ValueError, FileNotFoundError: If the lift does not support the scene, an option is out of range, or nerfstudio
             misreads the pixel values of an image.
-        PermissionError: if the folder of the run or of the lift's caches is not writable.
+        PermissionError: If the folder of the run or of the lift's caches is not writable.
     """
     config: Any = trainer.config
     path = trainer.base_dir / "config.yml"
@@ -118,10 +118,10 @@ def dataset_folder(config: TrainerConfig) -> Path:
 
 
 def feature_source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSource:
-    """Make the feature source of a config. By default, LangSplat's features are read from the dataset.
+    """Make the feature source of a config. LangSplat's features are read from the dataset unless a folder is given.
 
     Raises:
-        ValueError, FileNotFoundError: if `make_source` fails. The message names the options of ns-train.
+        ValueError, FileNotFoundError: If `make_source` fails. The message names the options of ns-train.
     """
     options = _source_options(config)
     try:

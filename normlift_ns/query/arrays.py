@@ -30,7 +30,7 @@ from normlift_ns.query.text_encoder import text_encoder_for, with_text_source
 _DIRECTION_BLOCK = 8 * PROMPT_BLOCK
 """Number of prompts for which float16 directions are converted once. The conversion takes most of the time."""
 _BLOCK_ELEMENTS = 2**21
-"""Number of elements to convert to float32 at a time, which fits into a processor's cache."""
+"""Number of elements to convert to float32 at a time, so that they fit into a processor's cache."""
 
 
 class ArrayField(FieldArrays):
@@ -57,13 +57,13 @@ class ArrayField(FieldArrays):
         """Return the cosine of every Gaussian's direction to Q vectors, as `SemanticField.query` does.
 
         Raises:
-            ValueError: the vectors have a different dimension than the field.
+            ValueError: The vectors have a different dimension than the field.
         """
         arrays, dimension = self.arrays, int(self.manifest["dimension"])
         if text_vectors.shape[1] != dimension:
             raise InputError(
-                f"text embeddings must be [Q, {dimension}] like the features of the field, got {text_vectors.shape}. "
-                "Use the encoder of these features."
+                f"text embeddings must have shape [Q, {dimension}] like the features of the field, got "
+                f"{text_vectors.shape}. Use the encoder of these features."
             )
         vectors = text_vectors.astype(np.float64)
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -87,7 +87,7 @@ class ArrayField(FieldArrays):
         return cosine.T
 
     def _evidence_products(self, vectors: Float[np.ndarray, "q d"]) -> Callable[[slice], Float32[np.ndarray, "b m"]]:
-        """Return a function that computes the cosines to some of the vectors, of the Gaussians with a direction."""
+        """Return a function that computes the cosines of all directions to a slice of the vectors."""
         arrays, rows = self.arrays, cast(Any, self.evidence).rows
         valid = arrays["norm"] > 0
         table = arrays["features"].astype(np.float64) @ vectors.T
@@ -96,7 +96,7 @@ class ArrayField(FieldArrays):
         return lambda block: ((matrix @ table[:, block])[valid] / length).T.astype(np.float32)
 
     def _direction_products(self, vectors: Float[np.ndarray, "q d"]) -> Callable[[slice], Float32[np.ndarray, "b m"]]:
-        """Return a function as `_evidence_products` does."""
+        """Return a function like that of `_evidence_products`, for a field that stores directions."""
         coordinates, basis = self.arrays["coordinates"], self.arrays.get("basis")
         projected = vectors.astype(np.float32) if basis is None else vectors.astype(np.float32) @ basis.T
         step = max(1, _BLOCK_ELEMENTS // projected.shape[1])
@@ -148,10 +148,10 @@ class QuickRun:
         """Run a query. The arrays of the answer are NumPy arrays.
 
         Args:
-            texts: prompts.
-            rules: keyword arguments of `make_query`.
+            texts: Prompts.
+            rules: Keyword arguments of `make_query`.
         Raises:
-            ValueError: as in `make_query`.
+            ValueError: See `make_query`.
         """
         question = make_query(self, self.text_encoder.rows, texts, **rules)
         return run_query(self.field, self.field.arrays["means"], question)
@@ -167,16 +167,16 @@ def open_quick(
 ) -> QuickRun | None:
     """Open the field of a lifted run; return None if its files do not determine the centers of the Gaussians.
 
-    Runs of version 0.1 do not store the centers, and other runs may have checkpoints that are newer than the lift. Such
-    runs need `means`.
+    Runs of version 0.1 do not store the centers, and other runs may have checkpoints that are newer than the lift. In
+    both cases, `means` is needed.
 
     Args:
-        load_config: path of the run's config.yml.
-        means: centers of the Gaussians, from a scene that `open_run` has matched with the field.
-        device: device for the network of the text encoder.
-        text_embeddings, prompt_template: as in `open_run`.
+        load_config: Path of the run's config.yml.
+        means: Centers of the Gaussians, from a scene that `open_run` has matched with the field.
+        device: Device for the network of the text encoder.
+        text_embeddings, prompt_template: As in `open_run`.
     Raises:
-        FileNotFoundError, ValueError: the run has no semantic field, or its files are damaged.
+        FileNotFoundError, ValueError: The run has no semantic field, or its files are damaged.
     """
     run_dir = Path(os.path.abspath(load_config)).parent
     check_run(run_dir)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 _CENTRAL = (0.05, 0.95)
 """Quantiles of the selected centers that bound their extent."""
 _SUMMARIZED = ("reliability", "weight")
-"""Scalars per Gaussian of which an answer gives means."""
+"""Scalars per Gaussian from which the summary of a prompt is computed."""
 _THREADS = min(8, os.cpu_count() or 1)
 """Number of prompts that are summarized concurrently."""
 
@@ -64,7 +64,7 @@ class QueryField(HasManifest, Protocol):
         ...
 
     def null_levels(self, *, refined: bool = True) -> Any:
-        """Return the null level of every Gaussian as one column; without null levels, return an array of no columns."""
+        """Return the null level of every Gaussian as one column, or an array without columns if there are none."""
         ...
 
 
@@ -152,7 +152,7 @@ class Answer:
             return list(pool.map(Finding.to_json, answer))
 
     def _as_numpy(self) -> Answer:
-        """Return the answer with the arrays of its prompts on the CPU, copied at once."""
+        """Return the answer with its arrays on the CPU. Each array is copied once for all prompts."""
         arrays = {name: as_numpy(getattr(self, name)) for name in ("means", "relevancy", "valid", "selected")}
         scalars = SimpleNamespace(**{name: as_numpy(getattr(self.field.scalars, name)) for name in _SUMMARIZED})
         field: Any = SimpleNamespace(manifest=self.field.manifest, scalars=scalars)
@@ -164,8 +164,8 @@ class Answer:
 class Finding:
     """Result of a query for one prompt.
 
-    Positions are in scene units, and None if no Gaussian is selected. Means are weighted by W_j, the total weight of
-    Gaussian j over all views.
+    Positions are in scene units. The centroid, the extent and the mean reliability are None if no Gaussian is selected.
+    Means are weighted by W_j, the total weight of Gaussian j over all views.
 
     >>> import torch
     >>> from normlift_ns import Evidence, SemanticField, lift
@@ -297,8 +297,8 @@ class Finding:
 class SelectionStats(NamedTuple):
     """Summary numbers of selected Gaussians.
 
-    Positions are in scene units, and None if no Gaussian is selected. Means are weighted by W_j, the total weight of
-    Gaussian j over all views.
+    Positions are in scene units. Means are weighted by W_j, the total weight of Gaussian j over all views. All numbers
+    except the fraction are None if no Gaussian is selected.
     """
 
     fraction: float
@@ -346,9 +346,9 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
     If `question.suggest_threshold` is set, the query in the answer has the suggested threshold.
 
     Args:
-        means: centers of the Gaussians, as a tensor or array like those of the field.
+        means: Centers of the Gaussians, as a tensor or array like those of the field.
     Raises:
-        ValueError: the embeddings have a different dimension than the field, or the negatives that the rule needs are
+        ValueError: The embeddings have a different dimension than the field, or the negatives that the rule needs are
             missing.
     """
     vectors, count = question.embeddings, len(question.embeddings)
@@ -414,13 +414,13 @@ def apply_threshold(answer: Answer, question: Query) -> Answer:
 
 HISTOGRAM_BINS = 32
 _AT_TOP = 1e-3
-"""Distance from the top, as a fraction of the range of relevancies, below which the median counts as at the top."""
+"""Fraction of the range of relevancies. A median whose distance from the top is smaller counts as being at the top."""
 _EPSILON = 1e-6
 """Smallest width of a histogram, and distance of the suggested threshold below the top if all relevancies are equal."""
 _SMALLEST_OBJECT = 20
 """Number of Gaussians of the smallest object that a suggested threshold may select."""
 _STABLE_OVER = 0.2
-"""Change of f to which the selection must be stable."""
+"""Change of f over which the selection must be stable."""
 _STEPS = 100
 """Number of thresholds between the median and u at which the selected Gaussians are counted."""
 _BARS = " ▁▂▃▄▅▆▇█"
@@ -463,10 +463,10 @@ def relevancy_histogram(
     """Return the histogram of one prompt; None if no Gaussian has a direction.
 
     Args:
-        relevancy: relevancies of all Gaussians.
+        relevancy: Relevancies of all Gaussians.
         valid: True for Gaussians that have a direction.
-        threshold: relevancy above which a Gaussian is selected.
-        positions: result of `suggested_range`.
+        threshold: Relevancy above which a Gaussian is selected.
+        positions: Result of `suggested_range`.
     """
     values = _ascending(relevancy[valid])
     if len(values) == 0:
@@ -501,7 +501,7 @@ def draw_histogram(
 
 
 def suggested_range(field: HasManifest) -> tuple[float, float]:
-    """Return the range of suggested thresholds between the median (0) and the top (1), for the field's encoder."""
+    """Return the range of the fraction f (see above) in which thresholds are suggested for the field's encoder."""
     kind = find_encoder_kind(encoder_name(field))
     return EncoderKind.suggested if kind is None else kind.suggested
 
@@ -512,7 +512,7 @@ def suggest_threshold(
     """Suggest one threshold for all prompts of a query; return None if no Gaussian has a direction.
 
     Args:
-        positions: result of `suggested_range`.
+        positions: Result of `suggested_range`.
 
     >>> values = np.array([[0.1]] * 60 + [[0.2]] * 30 + [[0.9]] * 10)
     >>> 0.2 < suggest_threshold(values, np.ones(100, bool), (0.4, 0.8)) < 0.9

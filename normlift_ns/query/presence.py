@@ -32,7 +32,7 @@ def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
 
 
 def compares_cosines(manifest: Mapping[str, Any], encoder: str | None) -> bool:
-    """Return whether `judge` uses cosines, with limits of the encoder or with null words, and not relevancies."""
+    """Return whether `judge` uses cosines (with limits of the encoder or null words) instead of relevancies."""
     kind = find_encoder_kind(encoder)
     return (kind is not None and kind.present_from is not None) or null_rank(manifest, 0.0) is not None
 
@@ -43,11 +43,11 @@ def judge(
     """Return the verdict on a prompt; None if there are no null words, limits or negatives to compare with.
 
     Args:
-        manifest: manifest of the field.
-        encoder: name of the encoder of the field.
-        rule: relevancy rule of the query.
-        top_cosine: cosine that one Gaussian in a thousand exceeds.
-        top: relevancy that one Gaussian in a thousand exceeds.
+        manifest: Manifest of the field.
+        encoder: Name of the encoder of the field.
+        rule: Relevancy rule of the query.
+        top_cosine: Cosine that one Gaussian in a thousand exceeds.
+        top: Relevancy that one Gaussian in a thousand exceeds.
     """
     kind, rank = find_encoder_kind(encoder), null_rank(manifest, top_cosine)
     if kind is not None and kind.present_from is not None:

@@ -1,4 +1,4 @@
-"""Queries for a semantic field: prompts with their embeddings, and the rule that selects Gaussians.
+"""Queries for a semantic field: lines of prompts, their embeddings, and the rule that selects Gaussians.
 
 This module does not need torch.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,40 @@ from normlift_ns.io.run_dir import MANIFEST_FILE, read_manifest
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, check_bool, check_number, renamed, short_repr
 from normlift_ns.query.text_encoder import DefaultRule, HasManifest, default_rule, encoder_digest
 
+_PROMPT = re.compile(r'\s*(?:"([^"]*)"|([^,;\n]*))\s*(?:[,;\n]|$)')
+
+
+def split_prompts(text: str) -> list[str]:
+    """Split a text into prompts at commas, semicolons and line breaks outside quotes; drop duplicates.
+
+    >>> split_prompts('red mug , bowl;;"salt, pepper"; bowl')
+    ['red mug', 'bowl', 'salt, pepper']
+    """
+    parts = (" ".join((quoted or bare).split()) for quoted, bare in _PROMPT.findall(text))
+    return list(dict.fromkeys(part for part in parts if part))
+
+
+def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
+    """Split every text of an option with `split_prompts`.
+
+    Raises:
+        ValueError: there are texts, but no prompts in them.
+    """
+    prompts = tuple(dict.fromkeys(prompt for text in texts for prompt in split_prompts(text)))
+    if len(texts) > 0 and len(prompts) == 0:
+        raise InputError(f"{name} has only separators, got {', '.join(map(repr, texts))}; give at least one prompt")
+    return prompts
+
+
+def join_prompts(texts: Sequence[str]) -> str:
+    """Join texts into a line that `split_prompts` splits into the same texts.
+
+    >>> join_prompts(["red mug", "salt, pepper"])
+    'red mug, "salt, pepper"'
+    """
+    lines = (" ".join(text.replace('"', " ").split()) for text in texts)
+    return ", ".join(f'"{line}"' if re.search("[,;]", line) else line for line in lines)
+
 
 def as_numpy(array: Any) -> np.ndarray:
     """Return a NumPy array, or a tensor on any device, as a NumPy array."""
@@ -31,7 +66,7 @@ def as_numpy(array: Any) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """Query with Q prompts, their embeddings and the settings that select Gaussians. Embeddings may be tensors."""
+    """Query with Q prompts, their embeddings and the settings that select Gaussians. Tensors become NumPy arrays."""
 
     texts: tuple[str, ...]
     embeddings: Float[np.ndarray, "q d"]
@@ -79,19 +114,19 @@ def make_query(
     """Encode prompts as a query for a field.
 
     Args:
-        field: field to query.
-        encode: function from texts to one embedding each, of an encoder that fits the field.
-        texts: prompts.
-        negatives: negative prompts (default: those of the encoder, see `default_rule`).
-        relevancy: relevancy rule. "auto" is the rule of the encoder if `negatives` is None, cosine if `negatives` is
+        field: Field to query.
+        encode: Function that returns one embedding per text, from an encoder that fits the field.
+        texts: Prompts.
+        negatives: Negative prompts (default: those of the encoder, see `default_rule`).
+        relevancy: Relevancy rule. "auto" is the rule of the encoder if `negatives` is None, cosine if `negatives` is
             empty, and lerf otherwise.
-        threshold: relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests.
+        threshold: Relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests.
             None is the threshold of the encoder for its own rule, and otherwise that of `RELEVANCY_RULES`. For the rule
             cosine with an encoder that has a different rule, None is "auto", because no threshold suits all encoders.
-        min_reliability: minimum R of a selected Gaussian, in 0..1.
-        refined: use refined features.
+        min_reliability: Minimum R of a selected Gaussian, in 0..1.
+        refined: Use refined features.
     Raises:
-        ValueError: an argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
+        ValueError: An argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
     """
     _check_rules(negatives, relevancy, threshold)
     min_reliability = check_number("min_reliability", min_reliability)
@@ -147,7 +182,7 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
             f"negatives must be a list of strings, got the single string {negatives!r}. Write [{negatives!r}]."
         )
     if relevancy not in ("auto", *RELEVANCY_RULES):
-        raise InputError(f"relevancy must be auto, {', '.join(RELEVANCY_RULES)}; got {relevancy!r}")
+        raise InputError(f"relevancy must be one of auto, {', '.join(RELEVANCY_RULES)}; got {relevancy!r}")
     if isinstance(threshold, str) and threshold != "auto":
         raise InputError(f'threshold must be a number or "auto", got {short_repr(threshold)}')
 
@@ -182,9 +217,9 @@ def save_query(folder: Path, question: Query) -> Path:
     """Write queries.safetensors to the folder of a field, replacing an existing file, and return its path.
 
     Raises:
-        ValueError: the query is not valid, or does not match the field.
-        FileNotFoundError: the folder no longer exists.
-        OSError: the file cannot be written.
+        ValueError: The query is not valid, or does not match the field.
+        FileNotFoundError: The folder no longer exists.
+        OSError: The file cannot be written.
     """
     if not folder.is_dir():
         raise FileNotFoundError(
@@ -212,7 +247,7 @@ def load_query(folder: Path) -> Query | None:
     """Load the query stored in the folder of a field; return None if there is no stored query.
 
     Raises:
-        ValueError: the file is damaged, or does not contain a query.
+        ValueError: The file is damaged, or does not contain a query.
     """
     path = folder / QUERIES_FILE
     if not os.path.lexists(path):
@@ -229,10 +264,10 @@ def load_query(folder: Path) -> Query | None:
 
 
 def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
-    """Return the query with this metadata and these embeddings.
+    """Check the metadata and the arrays of embeddings, and return the query that they contain.
 
     Raises:
-        ValueError: the metadata or an embedding is not valid, they are inconsistent, or they do not match the field in
+        ValueError: The metadata or an embedding is not valid, both are inconsistent, or they do not match the field in
             the folder.
     """
     metadata = msgspec.json.decode(encoded, type=_Metadata)

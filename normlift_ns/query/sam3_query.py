@@ -1,12 +1,12 @@
-"""Lift of SAM 3 masks, with two regions per prompt and view: inside and outside the mask.
+"""Lift SAM 3 masks, with two regions per prompt and view: inside and outside the mask.
 
 The relevancy of a Gaussian for a prompt is the fraction of its weight inside the masks of the voting views,
 sum_v E_in / sum_v (E_in + E_out). The weights are those of the rasterizer that trained the scene.
 
-Masks can be wrong for a whole view, which misses an object or confuses it with another. Two rounds therefore determine
-the voting views. In the first round, all views in which SAM 3 found the prompt vote. In the second round, a view votes
-if the weighted intersection over union of its mask and the Gaussians selected in the first round exceeds one half. If
-none of these views has the prompt, the result is that of the first round.
+The mask of a whole view can be wrong, because SAM 3 misses an object or confuses it with another one. Two rounds
+therefore determine the voting views. In the first round, all views in which SAM 3 found the prompt vote. In the second
+round, a view votes if the weighted intersection over union of its mask and the Gaussians selected in the first round
+exceeds one half. If SAM 3 found the prompt in none of these views, the result is that of the first round.
 
 A view that does not vote is unlabeled, with `unlabeled="dilute"`, which lowers reliability. An object found in one of
 eight views therefore has the reliability of one view in eight. Agreement and reliability are those of `core.lift` for
@@ -35,7 +35,7 @@ from normlift_ns.rasterization.rasterize import rasterize_evidence
 from normlift_ns.rasterization.settings import RasterSettings
 
 MIN_MASK_FRACTION = 0.5
-"""Fraction of its weight inside the masks above which a Gaussian is selected."""
+"""A Gaussian is selected if the fraction of its weight inside the masks exceeds this number."""
 
 
 @dataclass(frozen=True)
@@ -122,17 +122,17 @@ def mask_evidence(
     """Rasterize the evidence of the masks of Q prompts; each view is rasterized once for all prompts.
 
     Args:
-        cameras: one camera per view.
-        masks: one mask per view and prompt; empty if the prompt was not found.
-        valid_pixels: mask of the pixels to use in each view; None for all pixels.
+        cameras: One camera per view.
+        masks: One mask per view and prompt; empty if the prompt was not found.
+        valid_pixels: Mask of the pixels to use in each view; None for all pixels.
         options: `rasterize_mode` and `settings` of `rasterize_evidence`.
     Raises:
-        ValueError: there are no views, or the masks do not match the number or size of the cameras.
+        ValueError: There are no views, or the masks do not match the number or size of the cameras.
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(
-            f"masks must have one set per camera, for one or more cameras; got {len(masks)} sets for {len(cameras)} "
-            "cameras"
+            f"expected one set of masks per camera, and at least one camera; got {len(masks)} sets for "
+            f"{len(cameras)} cameras"
         )
     labels: list[Int32[Tensor, "h w"]] = []
     inside: list[Bool[Tensor, "q c"]] = []
@@ -172,8 +172,8 @@ class SegmentationResult(NamedTuple):
         """Return the numbers of every prompt as plain Python types.
 
         Args:
-            means: centers of the Gaussians.
-            selected: selections of another query with the same prompts, for comparison.
+            means: Centers of the Gaussians.
+            selected: Selections of another query with the same prompts, for comparison.
         """
         return [self._row(text, means, selected[:, text]) for text in range(len(self.answers))]
 
@@ -212,15 +212,15 @@ def query_sam3(
     """Segment evenly spaced training views with SAM 3, and lift the masks.
 
     Args:
-        find_masks: function that returns SAM 3's mask of each prompt in an image.
-        texts: prompts.
-        views: maximum number of views.
-        min_reliability: minimum R of a selected Gaussian, in 0..1.
-        settings: constants of the rasterizer.
-        device: device of the rasterizer.
+        find_masks: Function that returns SAM 3's mask of each prompt in an image.
+        texts: Prompts.
+        views: Maximum number of views.
+        min_reliability: Minimum R of a selected Gaussian, in 0..1.
+        settings: Constants of the rasterizer.
+        device: Device of the rasterizer.
     Raises:
-        FileNotFoundError: an image does not exist.
-        ValueError: an image is damaged, or a prompt is too long.
+        FileNotFoundError: An image does not exist.
+        ValueError: An image is damaged, or a prompt is too long.
     """
     indices, masks, cameras, counted = sample_evenly(len(scene.train), views), [], [], []
     for index in indices:

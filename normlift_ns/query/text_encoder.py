@@ -25,7 +25,7 @@ from normlift_ns.io.atomic import text_digest
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions, names_of_0_2
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
-"""Options that determine the encoder or the text embeddings of a field. The manifest has their names of version 0.2."""
+"""Options that determine the encoder or the text embeddings of a field, by the names in manifests (version 0.2)."""
 PRECOMPUTED = "given"
 """Encoder name in the manifest for features provided by the user."""
 _CHOSEN = "texts_chosen"
@@ -69,7 +69,7 @@ def precomputed_settings(text_vectors: str | None) -> dict[str, Any]:
     """Return the settings for `text_encoder_for`, for features provided by the user.
 
     Args:
-        text_vectors: name of a file of text embeddings in the folder of the field; None if there is none.
+        text_vectors: Name of a file of text embeddings in the folder of the field; None if there is none.
     """
     settings = encoder_settings(SourceOptions(encoder="open_clip"))
     return {**settings, "encoder": PRECOMPUTED, "text_vectors": text_vectors}
@@ -79,8 +79,8 @@ def with_text_source(field: FieldT, *, text_embeddings: Path | None = None, temp
     """Return a copy of the field with another source of text embeddings.
 
     Args:
-        text_embeddings: file of text embeddings (default: that of the lift).
-        template: prompt template (default: that of the lift).
+        text_embeddings: File of text embeddings (default: that of the lift).
+        template: Prompt template (default: that of the lift).
     """
     changes = {
         "text_vectors": None if text_embeddings is None else os.path.abspath(text_embeddings),
@@ -96,11 +96,11 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
     """Return the text encoder that fits a field.
 
     Args:
-        device: device of the network, as in `choose_device`; "auto" runs a plain text tower on the CPU.
-        cache: folder for a cache of embeddings; None for no cache.
+        device: Device of the network, as in `choose_device`; "auto" runs the text tower of OpenCLIP on the CPU.
+        cache: Folder for a cache of embeddings; None for no cache.
     Raises:
-        ValueError: the encoder is unknown, or its weights or the text embeddings are not those of the lift.
-        FileNotFoundError: the weights or text embeddings no longer exist.
+        ValueError: The encoder is unknown, or its weights or the text embeddings are not those of the lift.
+        FileNotFoundError: The weights or text embeddings no longer exist.
     """
     options = _options(field)
     if options.text_embeddings is not None:
@@ -207,7 +207,7 @@ def own_words(field: HasManifest) -> tuple[str, ...]:
     """Return the words of the encoder's vocabulary or of the file of text embeddings, without default negatives.
 
     Raises:
-        ValueError, FileNotFoundError: the file is damaged or does not exist.
+        ValueError, FileNotFoundError: The file is damaged or does not exist.
     """
     stored = field.manifest.get("encoder")
     vectors = stored.get("text_vectors") if isinstance(stored, Mapping) else None
@@ -220,8 +220,8 @@ def own_words(field: HasManifest) -> tuple[str, ...]:
 def default_rule(field: HasManifest) -> DefaultRule:
     """Return the default rule, negatives and threshold of queries of a field.
 
-    The rule is contrast for a field with a null level. Without it, the rule is that of the encoder. The exceptions are
-    unknown encoders and files of text embeddings without the default negatives, which use cosine.
+    The rule is contrast for a field with a null level, and otherwise the rule of the encoder. It is cosine if the
+    encoder is unknown, or if a file of text embeddings does not contain the encoder's default negatives.
     """
     if field.manifest.get("null_words") is not None:
         return _CONTRAST

@@ -55,7 +55,7 @@ def check_gpu(backend: str, job: RasterJob) -> None:
         other = str(job.dtype if means.dtype == torch.float32 else means.dtype).removeprefix("torch.")
         raise InputError(
             f'backend "{backend}" needs float32 on a GPU, got {other} on {means.device.type}; use backend="auto" to '
-            "choose one that supports them"
+            "choose a backend that supports these"
         )
 
 

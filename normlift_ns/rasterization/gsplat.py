@@ -1,8 +1,9 @@
 """Backend that uses stock gsplat on a GPU, and computes evidence as the gradient of its renders.
 
 With colors c_j and the image I_i = sum_j A_ij c_j, the gradient of sum_{i in s} I_i with respect to c_j is E_js. One
-backward pass with one-hot pixel gradients computes 32 regions. It runs only gsplat's own code, so it verifies
-`rasterization.triton`. It is slower, and results differ in their last bits between runs, because gsplat uses atomics.
+backward pass with one-hot pixel gradients computes 32 regions. This backend runs only gsplat's own code, so it can
+verify `rasterization.triton`. It is slower, and its results differ in their last bits between runs, because gsplat uses
+atomics.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ versions support these too."""
 _LARGE = 100.0
 """Scale in world units below which no determinant overflows, for focal lengths below 400,000 pixels."""
 _OVERFLOWS = 1e10
-"""Radius in pixels that is exceeded at any overflow. The determinant is of the order of (radius / 3) ** 4."""
+"""Lower bound of the radius in pixels if the determinant, of the order of (radius / 3) ** 4, overflows."""
 _LONGEST_RADIUS = 2**31 - 128
 """Largest int32 number that float32 represents exactly."""
 
@@ -117,7 +118,7 @@ def _project_enormous(
 
 
 def check(job: RasterJob) -> None:
-    """Raise ValueError if a scene is not float32 on a GPU, or its constants differ from those of installed gsplat."""
+    """Raise ValueError if a scene is not in float32 on a GPU, has 2D Gaussians, or needs another version of gsplat."""
     check_gpu("gsplat", job)
     if job.is_2d:
         raise InputError('backend "gsplat" draws 3D Gaussians only; use backend="triton" for 2D Gaussians')
@@ -127,8 +128,8 @@ def check(job: RasterJob) -> None:
     different = [name for name in names if getattr(job.settings, name) != getattr(compiled, name)]
     if len(different) > 0:
         raise InputError(
-            f"gsplat {installed_gsplat_version()} is compiled with a different {', '.join(different)} than the scene "
-            'needs; use backend="triton" or "torch", which support every gsplat version'
+            f"gsplat {installed_gsplat_version()} is compiled with other values of {', '.join(different)} than the "
+            'scene needs; use backend="triton" or "torch", which support every gsplat version'
         )
 
 
@@ -222,9 +223,9 @@ def _gradients(
     """Yield (first column, sums of A_ij by column) for 32 columns at a time. Column 0 is for unlabeled pixels.
 
     The compiled functions are called as in gsplat's autograd function (cuda/_wrapper.py). Its backward pass computes
-    the transmittance as 1 - alpha, with a relative error of up to 3e-4 near 1e-4. All weights of a pixel are
-    proportional to it, so they are multiplied by the ratio of the exact transmittance to it. The exact transmittance is
-    the render of a black scene on a white background.
+    the transmittance as 1 - alpha, with a relative error of up to 3e-4 for a transmittance near 1e-4. All weights of a
+    pixel are proportional to this number. They are therefore multiplied by the ratio of the exact transmittance to 1 -
+    alpha. The exact transmittance is the render of a black scene on a white background.
     """
     projections, settings = project_views(job, [camera]), job.settings
     colors = torch.zeros(1, len(job.scene), _CHANNELS, device=labels.device)

@@ -1,4 +1,4 @@
-"""Compiled CPU backend, which computes the sums of the torch backend with all cores."""
+"""Compiled CPU backend, which computes the same sums as the torch backend on all cores."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ def composite(
 def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) -> tuple[_Triple, _Triple, _Triple]:
     """Return the input of the kernels in three groups.
 
-    These are means, conics or transforms, and opacities; limits of alpha and transmittance; and offsets and members of
-    the tiles with shapes of the Gaussians.
+    The first group has the means, the conics or transforms, and the opacities. The second group has the limits of alpha
+    and transmittance. The third group has the offsets and members of the tiles, and the shapes of the Gaussians.
     """
     is_2d = isinstance(projected, ProjectedGaussians2D)
     kinds = projected.transforms.flatten(1) if is_2d else projected.conics
@@ -96,7 +96,7 @@ def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) ->
 
 
 _STRETCH = 0.1
-"""Relative growth of the covariance of a bounding ellipse with a different center than the ellipse that it bounds."""
+"""Relative growth of the covariance of a bounding ellipse, whose center differs from that of the bounded ellipse."""
 
 
 def _bounding_ellipses(projected: ProjectedGaussians2D, min_alpha: float) -> Float[Tensor, "m 3"]:
@@ -136,7 +136,7 @@ def compile_kernels(*dtypes: torch.dtype) -> Thread:
 
 
 def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, Any]]:
-    """Return (kernel, types of its arguments) for every kernel of this module, with those for rendering first."""
+    """Return (kernel, types of its arguments) for every kernel of this backend, beginning with those for rendering."""
     number = numba.float64 if dtype == torch.float64 else numba.float32
     integer, integers, numbers, table = numba.int64, numba.int64[::1], number[::1], number[:, ::1]
     labels, members, limits = numba.int32[:, ::1], numba.int32[::1], numba.types.UniTuple(number, 3)

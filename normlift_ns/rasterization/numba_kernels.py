@@ -82,7 +82,7 @@ def interleaved_index(position, count, threads):  # pragma: no cover (compiled)
 _REACH_MARGIN = 1e-2
 """Margin of the exponent at which alpha falls below min_alpha, so that rounding does not drop pixels."""
 _ROUNDINGS = 4
-"""Bound on the rounding error of an exponent, in units of machine epsilon times a dx^2 + c dy^2."""
+"""Bound on the rounding error of an exponent, in units of machine epsilon times (a dx^2 + c dy^2)."""
 
 
 @kernel
@@ -159,7 +159,8 @@ def list_tiles(
 ):  # pragma: no cover (compiled)
     """Return lists of the Gaussians that can contribute to pixels of each tile.
 
-    Their square touches the tile as in `projection.assign_tiles`, and alpha can reach min_alpha in the tile.
+    The square of each Gaussian touches the tile as in `projection.assign_tiles`, and its alpha can reach min_alpha in
+    the tile.
 
     Returns:
         The offsets and indices of `projection.TileLists`, and nine values of `_shape` for every Gaussian.
@@ -266,7 +267,7 @@ def _tile_box(tile, height, width, size):  # pragma: no cover (compiled)
 
 @parallel_kernel
 def count_labels(labels, size):  # pragma: no cover (compiled)
-    """Return the number of labels of every tile."""
+    """Return the number of distinct labels in every tile."""
     height, width = labels.shape
     counts = np.empty(((height + size - 1) // size) * ((width + size - 1) // size), np.int64)
     for tile in numba.prange(counts.size):
@@ -349,7 +350,7 @@ def _blend_2d(
 
 @fused_kernel
 def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, limits):  # pragma: no cover (compiled)
-    """Composite one Gaussian over a tile, and write A_ij to weights[row, chunk, lane], or 0 if it is not drawn.
+    """Composite one Gaussian over a tile. Write A_ij, or 0 if it is not drawn, to weights[row, chunk, lane].
 
     The transmittance of a pixel that has stopped is stored with a minus sign. Nine numbers in place of a conic are the
     transform of a Gaussian of 2D Gaussian Splatting.
@@ -491,7 +492,7 @@ def sum_tiles(  # pragma: no cover (compiled)
 
 @kernel
 def merge_slots(first_slot, used, slots, num_gaussians, num_columns):  # pragma: no cover (compiled)
-    """Return the slots sorted by (Gaussian, label + 1), with equal ones summed in the order of the tiles.
+    """Sort slots by (Gaussian, label + 1), and add up the weights of equal pairs in the order of the tiles.
 
     A counting sort orders slots by Gaussian. The labels of each Gaussian are summed in a dense row and then sorted.
     """

@@ -148,7 +148,7 @@ def project(
         world: Gaussians.
         camera: Camera of the image.
         settings: Constants of the rasterizer.
-        antialiased: Scale opacities by sqrt(det / det of the blurred covariance), as splatfacto does with
+        antialiased: Scale opacities by sqrt(det(covariance) / det(blurred covariance)), as splatfacto does with
             rasterize_mode "antialiased".
     """
     dtype, device = world.opacities.dtype, world.opacities.device
@@ -197,7 +197,7 @@ def project(
 
 
 _LEAST_EXTENT = 1e-4
-"""Least square of the half side of a projected ellipse of one standard deviation, in square pixels."""
+"""Lower bound for the squared half side of a projected ellipse of one standard deviation, in square pixels."""
 
 
 def project_2d(world: PreparedGaussians2D, camera: Camera, settings: RasterSettings) -> ProjectedGaussians2D:
@@ -240,7 +240,7 @@ def _between_planes(world: AnyPrepared, camera: Camera, settings: RasterSettings
 
 
 def _touch_image(means2d: Float[Tensor, "m 2"], radii: Float[Tensor, "m 2"], camera: Camera) -> Bool[Tensor, " m"]:
-    """Return whether the rectangles around the centers are finite, not empty, and touch the image."""
+    """Return a mask of the rectangles around the centers that are finite, not empty, and touch the image."""
     size = means2d.new_tensor([camera.width, camera.height])
     return (radii.isfinite() & (radii > 0) & (means2d + radii > 0) & (means2d - radii < size)).all(1)
 

@@ -48,10 +48,10 @@ def view_colors(
 def rotate_harmonics(coefficients: Float[Tensor, "n k 3"], rotation: Float64[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
     """Return the spherical harmonics of colors that rotate with their Gaussians.
 
-    The matrix of a rotation follows from the harmonics in many directions before and after it, by least squares.
+    Harmonics in many directions before and after the rotation determine its matrix by least squares.
 
     Args:
-        coefficients: Spherical harmonics without the constant one, in gsplat's order.
+        coefficients: Coefficients of the spherical harmonics without the constant term, in gsplat's order.
         rotation: Rotation of the Gaussians.
     """
     from gsplat.cuda._torch_impl import _eval_sh_bases_fast  # noqa: PLC0415 (slow import)
@@ -150,8 +150,9 @@ def rasterize_evidence(
             regions without pixels.
         backend: "torch" is the reference for any device and precision. "numba" is compiled for the CPU. "triton" is
             fast, for float32 on a GPU. "gsplat" is stock gsplat, for float32 on a GPU with weight_power 1 and constants
-            of the installed version or older. "auto" selects the fastest backend that supports device and precision.
-        progress: Callback after every view, with the number of views done and the number of views or None.
+            of the installed version or older. "auto" selects the fastest backend for the device and the precision.
+        progress: Callback after every view, with the number of finished views and the number of all views, or None if
+            the latter is unknown.
         options: Keyword arguments of `RasterOptions`.
 
     Raises:
@@ -253,12 +254,29 @@ def render(
     >>> image.tolist(), alpha.tolist()
     ([[[0.5, 0.0, 0.25]]], [[0.75]])
     """
+    options = {"backend": backend, "rasterize_mode": rasterize_mode, "settings": settings, "dtype": dtype}
+    return next(render_views(scene, [camera], values, **options))
+
+
+def render_views(
+    scene: GaussianScene,
+    cameras: Iterable[Camera],
+    values: Float[Tensor, "n c"],
+    *,
+    backend: BackendName = "auto",
+    rasterize_mode: RasterizeMode = "classic",
+    settings: RasterSettings | None = None,
+    dtype: torch.dtype | None = None,
+) -> Iterator[tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]]:
+    """Yield what `render` returns for each of several cameras; the Gaussians are prepared once."""
     if len(values) != len(scene):
         raise InputError(f"values must have shape [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
     job = _job(scene, rasterize_mode, settings, dtype)
     _, chosen = choose_backend(backend, job)
-    with torch.no_grad():
-        return chosen.composite(job, camera, values)
+    for camera in cameras:
+        with torch.no_grad():
+            image = chosen.composite(job, camera, values)
+        yield image
 
 
 def render_image(
@@ -322,11 +340,13 @@ def _job(
     if rasterize_mode not in ("classic", "antialiased"):
         raise InputError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
     if (dtype := dtype or scene.means.dtype) not in (torch.float32, torch.float64):
-        raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}; pass one for a {dtype} scene")
+        raise InputError(
+            f"dtype must be torch.float32 or torch.float64, got {dtype}; for a {dtype} scene, pass dtype=torch.float32"
+        )
     job = RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
     if job.is_2d and (job.antialiased or job.settings.per_axis):
-        problem = "a scene without antialiasing" if job.antialiased else "the rules of gsplat 1.4"
-        raise InputError(f"2D Gaussians are drawn only as {problem}")
+        problem = "without antialiasing" if job.antialiased else "by the rules of gsplat 1.4"
+        raise InputError(f"2D Gaussians can be drawn only {problem}")
     return job
 
 
@@ -476,8 +496,8 @@ def _check_pixels(pixels: Tensor, camera: Camera) -> Int64[Tensor, "p 2"]:
 _MAX_ALPHA, _MIN_ALPHA = 0.999, 1 / 255
 """Largest alpha, and smallest alpha that is not ignored, as in the rasterizer."""
 _MIN_SCALE_RATIO = 1e-4
-"""Smallest ratio of the standard deviations of a Gaussian. Larger ratios are limited, so that rays can hit the edges
-of flat Gaussians."""
+"""Smallest ratio of a standard deviation to the largest one of the same Gaussian. Smaller standard deviations are
+raised to this ratio, so that rays can hit the edges of flat Gaussians."""
 
 
 def ray_weights(
@@ -486,7 +506,7 @@ def ray_weights(
     """Return the weight alpha_j prod_{k<j} (1 - alpha_k) of every Gaussian along a ray, or 0 if the ray misses it.
 
     alpha_j is the opacity times the largest value of the Gaussian along the ray. Gaussians are sorted by the distance
-    of this maximum. There is no blur, so the result does not depend on the resolution of an image.
+    of this maximum from the origin. There is no blur, so the result does not depend on the resolution of an image.
 
     Args:
         scene: N Gaussians.

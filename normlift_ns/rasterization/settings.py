@@ -37,9 +37,9 @@ class RasterSettings:
     eps2d: float = 0.3
     """Blur that is added to the diagonal of the projected covariance, in square pixels."""
     frustum_margin: float = 0.3
-    """Margin around the image as a share of half the field of view. The Jacobian is constant outside this margin."""
+    """Margin around the image as a fraction of half the field of view. The Jacobian is constant outside this margin."""
     min_discriminant: float = 0.01
-    """Lower bound of b ** 2 - det in the larger eigenvalue of the projected covariance."""
+    """Lower bound of (trace / 2) ** 2 - det in the formula of the projected covariance's larger eigenvalue."""
     min_compensation: float = 0.0
     """Lower bound of the factor by which antialiasing scales opacities."""
     per_axis: bool = False
@@ -90,7 +90,7 @@ class RasterSettings:
     @staticmethod
     @check_arguments
     def recorded(manifest: Mapping[str, Any]) -> RasterSettings:
-        """Return the constants for `gsplat_rules` in a manifest, or those of gsplat 1.4 without this entry.
+        """Return the constants for the entries `gsplat_rules` (default: 1.4) and `clip_planes` of a manifest.
 
         Raises:
             ValueError: If the recorded version is unknown.

@@ -23,14 +23,14 @@ from normlift_ns.rasterization.backend import RasterBatch, RasterJob, check_gpu
 from normlift_ns.rasterization.settings import RasterSettings
 
 CELL, SMALL_CELL = (16, 16), (16, 8)
-"""Largest width and height of cells in pixels, for fewer than `_MANY` Gaussians and for more.
+"""Largest width and height of cells in pixels, for fewer than `_MANY` Gaussians, and for `_MANY` or more.
 
 With many Gaussians, smaller cells are faster, because the pixels of a cell have fewer Gaussians in common.
 """
 _MANY = 4_000_000
 """Smallest number of Gaussians for which `SMALL_CELL` is used."""
 _ELEMENTS, _MAX_VIEWS = 2**26, 16
-"""Largest product of views in a batch and Gaussians, and largest number of views in a batch.
+"""Largest number of views in a batch times Gaussians, and largest number of views in a batch.
 
 A view takes one byte per Gaussian and 120 bytes per visible Gaussian.
 """
@@ -41,7 +41,7 @@ _SHORT = 2**15
 
 
 def check(job: RasterJob) -> None:
-    """Raise ValueError if the scene is not float32 on a GPU, or the tile size is not a power of two."""
+    """Raise ValueError if the scene is not in float32 on a GPU, or the tile size is not a power of two."""
     size = job.settings.tile_size
     check_gpu("triton", job)
     if size < 1 or size & (size - 1) != 0:
@@ -97,7 +97,7 @@ def views_evidence(job: RasterJob, batch: RasterBatch, *, cull: bool = True) -> 
     Args:
         job: Scene and options.
         batch: Views to rasterize together.
-        cull: As in `build_cell_lists`. The entries do not depend on it.
+        cull: As in `build_cell_lists`. This does not change the entries.
     """
     grid, projected, lists = project_and_bin(job, batch.cameras, cull=cull)
     columns = max(batch.num_regions) + 1

@@ -1,8 +1,9 @@
 """Colors and legends of query results, the same in every viewer and figure.
 
-Relevancy is drawn with a perceptual colormap that is readable with color blindness. Opacity rises with relevancy, so
-that weak matches are less visible. A prompt that contains a color name is drawn in that color. Other prompts get colors
-that are distinguishable with any color vision (Okabe and Ito, 2008), or further hues if these colors are used up.
+Relevancy is drawn with a perceptually uniform colormap that is readable with color blindness. Opacity rises with
+relevancy, so that weak matches are less visible. A prompt that contains a color name is drawn in that color. Other
+prompts get colors that are distinguishable with any color vision (Okabe and Ito, 2008), or further hues if these colors
+are used up.
 """
 
 from __future__ import annotations
@@ -59,9 +60,9 @@ def apply_colormap(
     """Map relevancy to a color and an opacity over the scene.
 
     Args:
-        scale: relevancies of the first and the last color; relevancies outside this range are clamped.
-        colors: colors of a colormap, RGB in 0..1.
-        min_opacity: opacity of the first color; the last color has opacity `MAX_OVERLAY_OPACITY`.
+        scale: Relevancies of the first and the last color; relevancies outside this range are clamped.
+        colors: Colors of a colormap, RGB in 0..1.
+        min_opacity: Opacity of the first color; the last color has opacity `MAX_OVERLAY_OPACITY`.
 
     >>> apply_colormap(torch.tensor([0.0, 0.5, 1.0]), (0.0, 1.0), colormap_rgb("viridis"))[1]
     tensor([0.3500, 0.6250, 0.9000])
@@ -71,7 +72,7 @@ def apply_colormap(
 
 
 def named_color(text: str) -> tuple[float, float, float] | None:
-    """Return the first saturated color that a prompt names, as RGB in 0..1; None without such a color.
+    """Return the first saturated color that a prompt names, as RGB in 0..1; None if it names no saturated color.
 
     The color names are those of the XKCD color survey.
 
@@ -138,7 +139,7 @@ def prompt_rgb_tuples(texts: Sequence[str]) -> list[RGB]:
 
 
 MIN_LEGEND_HEIGHT = 160
-"""Minimum height in pixels of an image with a legend; the small images of a moving camera have none."""
+"""Minimum height in pixels of an image with a legend. Smaller images, as rendered while the camera moves, have none."""
 _MAX_PROMPTS = 12
 _BACKDROP, _INK = (20, 20, 20), (255, 255, 255)
 _BACKDROP_OPACITY = 0.75
@@ -155,7 +156,7 @@ def clip_text(text: str, most: int) -> str:
 
 @lru_cache(maxsize=16)
 def load_font(size: int) -> ImageFont.FreeTypeFont:
-    """Load matplotlib's DejaVu Sans font, the font of all images, in a size in pixels."""
+    """Load matplotlib's DejaVu Sans, the font of all images, at a size in pixels."""
     from matplotlib import get_data_path  # noqa: PLC0415 (a lift does not need it)
 
     return ImageFont.truetype(str(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
@@ -168,8 +169,8 @@ def add_color_bar(
 
     Args:
         image: RGB in 0..1.
-        scale: values of the first and the last color.
-        title: title above the color bar.
+        scale: Values of the first and the last color.
+        title: Title above the color bar.
     """
     height, width = image.shape[:2]
     tile = None if height < MIN_LEGEND_HEIGHT else _color_bar(colormap, scale, clip_text(title, 28), _font_size(height))

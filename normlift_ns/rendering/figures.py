@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from normlift_ns.analysis.inventory import Inventory, as_instances
-from normlift_ns.analysis.objects import MIN_VIEW_SHARE, evidence_weights, object_color, view_shares
+from normlift_ns.analysis.inventory import Inventory
+from normlift_ns.analysis.objects import MIN_VIEW_SHARE, evidence_weights, object_color
 from normlift_ns.core.device import prefetch_map
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera
@@ -50,7 +50,7 @@ class Display:
 
     values: Float[Tensor, "n q_plus_5"]
     """Columns: relevancy of each prompt, relevancy shown in the overlay, selected (0 or 1), selected by any prompt
-    (0 or 1), R, N_eff."""
+    (0 or 1), R, and N_eff."""
     scale: tuple[float, float]
     """Relevancies of the first and the last color of the overlay."""
     map_scale: tuple[float, float]
@@ -93,9 +93,9 @@ def make_display(
     """Make the display of an answer on the device of the field.
 
     Args:
-        shown: index of the only prompt to show (default: all prompts).
-        selection: mask of the selected Gaussians (default: those that the answer selects).
-        drawn: mask of the Gaussians to draw (default: all).
+        shown: Index of the only prompt to show (default: all prompts).
+        selection: Mask of the selected Gaussians (default: those that the answer selects).
+        drawn: Mask of the Gaussians to draw (default: all).
         by_hand: True if `selection` is independent of the answer.
     """
     scalars = field.scalars
@@ -161,10 +161,10 @@ def render_outputs(
     other outputs are scalars sum_j A_ij value_j, 0 for empty pixels.
 
     Args:
-        rgb: rendered scene, RGB in 0..1.
-        image: composited `display.values`.
-        alpha: opacity of every pixel.
-        named_by_text: return relevancies as color images with the names of `output_names`, for a viewer. Otherwise,
+        rgb: Rendered scene, RGB in 0..1.
+        image: Composited `display.values`.
+        alpha: Opacity of every pixel.
+        named_by_text: Return relevancies as color images with the names of `output_names`, for a viewer. Otherwise,
             return them as scalars with the names relevancy_0, relevancy_1, …
     """
     count = display.num_prompts
@@ -200,7 +200,7 @@ def overlay(
     """Color the selection by relevancy over the scene in gray; opacity increases with relevancy.
 
     Args:
-        share: selected fraction of each pixel, in 0..1.
+        share: Selected fraction of each pixel, in 0..1.
     """
     color, opacity = colors.apply_colormap(relevancy, display.scale, colors.colormap_rgb(display.colormap).to(rgb))
     return _over_gray(rgb, color, share.clamp(0, 1) * opacity[:, :, None])
@@ -224,9 +224,9 @@ def segmentation(
     """Draw the selection in the color of the most relevant prompt over the scene in gray.
 
     Args:
-        labels: index of the most relevant prompt of each pixel.
-        share: selected fraction of each pixel, in 0..1.
-        palette: colors of the prompts, RGB in 0..1.
+        labels: Index of the most relevant prompt of each pixel.
+        share: Selected fraction of each pixel, in 0..1.
+        palette: Colors of the prompts, RGB in 0..1.
     """
     return _over_gray(rgb, palette[labels], SEGMENTATION_OPACITY * share.clamp(0, 1))
 
@@ -237,7 +237,7 @@ def reliability_map(
     """Return a map of R on a fixed scale from 0 to 1, with its legend.
 
     Args:
-        reliability: composited R.
+        reliability: Composited R.
     """
     pixel = pixel_relevancy(reliability, alpha)[:, :, 0]
     color = colors.colormap_rgb(colors.RELIABILITY_COLORMAP).to(rgb)[(pixel.clamp(0, 1) * 255).round().long()]
@@ -321,11 +321,11 @@ def view_figure(
     """Draw a figure of one view, with the training image next to the overlay.
 
     Args:
-        header: title and summary above the figure.
-        view: name of the view.
-        image: training image; None to show only the overlay.
-        overlay: rendered overlay of the same view.
-        selected: mask of the selected pixels, which the figure outlines.
+        header: Title and summary above the figure.
+        view: Name of the view.
+        image: Training image; None to show only the overlay.
+        overlay: Rendered overlay of the same view.
+        selected: Mask of the selected pixels, which the figure outlines.
     """
     panel = _outlined(overlay, selected, _PANEL_WIDTH)
     panels = {} if image is None else {"training image": Image.fromarray(image.cpu().numpy()).resize(panel.size)}
@@ -342,9 +342,9 @@ def contact_sheet(
     """Draw a figure of all views for one prompt.
 
     Args:
-        header: title and summary above the figure.
-        panels: overlay of each view with an outline of the selection, of the width `_panel_width`.
-        views: names of the views.
+        header: Title and summary above the figure.
+        panels: Overlay of each view with an outline of the selection, of the width `_panel_width`.
+        views: Names of the views.
     """
     return _page(sheet, [header.title, header.summary], panels, views, _columns(len(panels)))
 
@@ -450,16 +450,16 @@ def save_overlays(
     figures share one color scale.
 
     Args:
-        cameras: training cameras by file name prefix, as from `training_cameras`.
-        settings: rasterizer settings (default: those of gsplat 1.4).
+        cameras: Training cameras by file name prefix, as `training_cameras` returns them.
+        settings: Rasterizer settings (default: those of gsplat 1.4).
         device: torch device that renders.
-        overwrite: replace existing files.
+        overwrite: Replace existing files.
     Returns:
         Paths of the files.
     Raises:
-        FileExistsError: a file exists, and `overwrite` is False.
-        OSError: a file cannot be written.
-        ValueError: two figures would have the same name.
+        FileExistsError: A file exists, and `overwrite` is False.
+        OSError: A file cannot be written.
+        ValueError: Two figures would have the same name.
     """
     prefixes = [*([CONTACT_SHEET_PREFIX] if len(cameras) > 1 else []), *cameras]
     ends = [f"{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)]
@@ -516,7 +516,7 @@ def _render_overlays(
     settings: RasterSettings | None,
     device: str,
 ) -> Iterator[tuple[str, list[_Overlay]]]:
-    """Yield the name of every view with the overlays of all prompts, which are rendered at once."""
+    """Yield the name of every view with the overlays of all prompts, which are rendered together."""
     count, gaussians = len(answer.texts), scene.gaussians.to(device)
     values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1).to(device)
     for name, camera in cameras.items():
@@ -540,9 +540,9 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
     """Return training cameras by unique file name.
 
     Args:
-        names: names from `unique_file_names`, or image paths with or without suffix (default: three views).
+        names: Names from `unique_file_names`, or image paths with or without suffix (default: three views).
     Raises:
-        ValueError: a name matches no training image, or several.
+        ValueError: A name matches no training image, or several.
     """
     images, cameras = list(scene.train.names), scene.train.cameras
     unique = unique_file_names(images)
@@ -575,22 +575,21 @@ def save_inventory(
 ) -> str:
     """Write a PNG render of the scene with outlines, numbers and names of the objects of an inventory.
 
-    The camera is that of the training image that shows the most objects. Among several such images, it is the one in
-    which the objects cover the largest area.
+    The camera is that of the training image that shows the most objects. Among several such images, it is the one with
+    the largest objects, each compared with its largest size in any image.
 
     Args:
-        path: file to write.
-        manifest: manifest of the field, with the settings of the rasterizer.
-        overwrite: replace an existing file.
+        path: File to write.
+        manifest: Manifest of the field, with the settings of the rasterizer.
+        overwrite: Replace an existing file.
     Returns:
         Name of the training image.
     Raises:
-        FileExistsError: the file exists, and `overwrite` is False.
-        OSError: the file cannot be written.
+        FileExistsError: The file exists, and `overwrite` is False.
+        OSError: The file cannot be written.
     """
     settings, count = RasterSettings.recorded(manifest), len(inventory)
-    instances = as_instances(inventory.instance_id, tuple(item.text for item in inventory.catalog.objects))
-    shares = view_shares(scene, instances, settings, str(scene.gaussians.means.device))
+    shares = inventory.catalog.view_shares
     shares = shares / shares.amax(dim=1, keepdim=True).clamp(min=1e-12)
     shown = (shares >= MIN_VIEW_SHARE).sum(dim=0) + shares.sum(dim=0) / max(count, 1)  # the second term is below 1
     view = int(shown.argmax())
@@ -645,14 +644,14 @@ def write_masks(
     images of the training.
 
     Args:
-        invert: write 0 for pixels that show the selection, and 255 for others.
-        settings: rasterizer settings (default: those of gsplat 1.4).
-        overwrite: replace existing files.
+        invert: Write 0 for pixels that show the selection, and 255 for others.
+        settings: Rasterizer settings (default: those of gsplat 1.4).
+        overwrite: Replace existing files.
     Returns:
         Paths of the files.
     Raises:
-        FileExistsError: a file exists, and `overwrite` is False.
-        OSError: a file cannot be written.
+        FileExistsError: A file exists, and `overwrite` is False.
+        OSError: A file cannot be written.
     """
     files = mask_files(scene, folder)
     with atomic_files(*files, overwrite=overwrite) as drafts:

@@ -24,8 +24,7 @@ from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d
 
-from normlift_ns.encoders.package_files import EDGES
-from normlift_ns.encoders.weights import third_party_errors
+from normlift_ns.encoders.weights import EDGES, third_party_errors
 from normlift_ns.errors import InputError
 from normlift_ns.segmentation.regions import RegionDefaults, resample_nearest
 from normlift_ns.segmentation.sam import resize_bilinear
@@ -44,7 +43,7 @@ _MEAN = (104.00699, 116.66877, 122.67892)
 _MARGIN = 16
 """Width of the mirrored margin around an image, in pixels. Without it, the network detects edges along the border."""
 _HEIGHTS = 256
-"""Number of values of an edge map. A small number hides the rounding errors of devices."""
+"""Number of possible values of an edge map. A small number hides the different rounding errors of devices."""
 ALGORITHM = 2
 """Part of the cache key of regions. Increase it with each change of this module that changes regions."""
 
@@ -182,7 +181,7 @@ def _lowest_passes(basins: Int64[np.ndarray, "h w"], edges: UInt8[np.ndarray, "h
 
 @dataclass(frozen=True)
 class EdgeRegions(RegionDefaults):
-    """Regions between the edges that HED detects. Weights are loaded at first use.
+    """Regions between the edges that HED detects. Weights are loaded on first use.
 
     The regions of an image are reproducible on the same device. Other devices and thread counts change the rounding of
     the network, and thereby single pixels of the edge map.
@@ -235,7 +234,7 @@ class EdgeRegions(RegionDefaults):
 
     @cached_property
     def network(self) -> EdgeNetwork:
-        """The network with its weights, loaded at first use. Raises the same errors as `edges`."""
+        """The network with its weights, loaded on first use. Raises the same errors as `edges`."""
         network = EdgeNetwork()
         read_edge_weights(network, EDGES.read())
         return network.to(self.device)

@@ -1,8 +1,7 @@
-"""Filtering of binary masks, with boxes, suppression, label maps, and removal of small holes and pieces."""
+"""Filtering of binary masks, with boxes, suppression, and removal of small holes and pieces."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,8 +11,8 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
-_CHUNK = {"cuda": 2**29, "cpu": 2**26}
-"""Number of elements of the largest temporary array, by device type."""
+from normlift_ns.segmentation.regions import column_chunks
+
 _MIN_KEPT = 3
 """Number of the best masks that are kept if no score is high enough."""
 
@@ -93,25 +92,6 @@ def mask_nms(
     return keep
 
 
-def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
-    """Convert masks to a stack of label maps.
-
-    At each pixel, the first map has the index of the last mask that covers it, and each further map the index of the
-    previous one. Remaining entries are -1. The depth of the stack is the largest number of masks that share a pixel, at
-    least 1.
-    """
-    flat = masks.flatten(1)
-    depth = max(1, int(flat.sum(dim=0).max()))
-    labels = torch.full((depth, flat.shape[1]), -1, dtype=torch.int32, device=masks.device)
-    for columns in _column_chunks(flat):
-        part = flat[:, columns].flip(0)
-        pixel, flipped = part.T.nonzero(as_tuple=True)  # by pixel, with the last mask of each pixel first
-        count = part.sum(dim=0)
-        layer = torch.arange(len(pixel), device=masks.device) - (count.cumsum(0) - count)[pixel]
-        labels[layer, columns.start + pixel] = (len(masks) - 1 - flipped).int()
-    return labels.reshape(depth, *masks.shape[1:])
-
-
 def masks_to_boxes(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:
     """Return the box (x0, y0, x1, y1) of each mask, in pixels and with inclusive ends; zeros for an empty mask."""
     ends = []
@@ -129,7 +109,7 @@ def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
     """
     flat = masks.flatten(1)
     both = torch.zeros(len(flat), len(flat), dtype=torch.float64, device=masks.device)
-    for columns in _column_chunks(flat):
+    for columns in column_chunks(flat):
         both += _row_products(flat[:, columns])
     return both
 
@@ -145,11 +125,6 @@ def _row_products(part: Bool[Tensor, "m p"]) -> Tensor:
         return torch._int_mm(padded, padded.T)[:count, :count]  # pyright: ignore[reportPrivateImportUsage]
     exact = part.float()
     return exact @ exact.T
-
-
-def _column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
-    step = min(2**24, max(1, _CHUNK[flat.device.type] // max(1, len(flat))))
-    return (slice(start, start + step) for start in range(0, flat.shape[1], step))
 
 
 # Removal of small holes and pieces, for all masks together and on their device.

@@ -26,6 +26,8 @@ from normlift_ns.io.memory import free_memory
 _IMAGE_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM")
 """Formats of training images. Pillow passes some other formats to external programs, such as PostScript to
 Ghostscript."""
+_MASK_CHUNK = {"cuda": 2**29, "cpu": 2**26}
+"""Number of elements of the largest temporary array of masks, by device type."""
 _MAX_PIXELS = 2**27
 """Largest number of pixels, 16,384 x 8,192. A file of a few bytes can decode to a huge image of equal pixels."""
 
@@ -89,7 +91,7 @@ _WORKERS = max(1, min(16, os.cpu_count() or 1, _FREE // _IMAGE_BYTES))
 
 
 class RegionDefaults:
-    """Defaults of `Regions` for mask sources with one level and no files that segment one image at a time."""
+    """Defaults of `Regions` for mask sources that have one level and no files, and segment one image at a time."""
 
     at_once = 1
 
@@ -149,7 +151,7 @@ class Grid(RegionDefaults):
 
 @dataclass(frozen=True)
 class LabelFiles(RegionDefaults):
-    """Label maps from a folder, one per image and of the size of the image.
+    """Label maps from a folder, one per image, each of the size of its image.
 
     A PNG file is grayscale with 1, 8 or 16 bits, or indexed, with palette indices as labels. An NPY file has any
     integer type, and can contain several levels, [levels, H, W]. The map of "images/left/0001.jpg" is the first of
@@ -183,7 +185,7 @@ class LabelFiles(RegionDefaults):
     def __post_init__(self) -> None:
         if not os.path.isdir(self.folder):
             raise FileNotFoundError(
-                f"folder of {self.description}s {self.folder} does not exist ({self.flag}); give a folder with one "
+                f"the folder of {self.description}s {self.folder} does not exist ({self.flag}); give a folder with one "
                 "PNG or NPY file per image"
             )
 
@@ -275,7 +277,7 @@ class LabelFiles(RegionDefaults):
             bits = gray_bit_depth(path)
             if bits in (2, 4):
                 raise InputError(
-                    f"{what} is a grayscale PNG with {bits} bits, whose values image readers multiply by "
+                    f"{what} is a grayscale PNG with {bits} bits per pixel, whose values image readers multiply by "
                     f"{255 // (2**bits - 1)}; save it as grayscale with 8 or 16 bits, as an indexed PNG, or as NPY"
                 )
         if maps.ndim == 3 and path.suffix == ".png":
@@ -284,7 +286,7 @@ class LabelFiles(RegionDefaults):
                 "it as an 8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
         if maps.dtype.kind not in "iub":
-            raise InputError(f"{what} holds {maps.dtype}, expected an integer type; save it with .astype(numpy.int32)")
+            raise InputError(f"{what} has type {maps.dtype}, expected an integer; save it with .astype(numpy.int32)")
         if maps.ndim not in (2, 3) or maps.size == 0:
             raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps
@@ -316,3 +318,28 @@ def _compact(values: np.ndarray, labeled: np.ndarray) -> Int32[Tensor, "h w"]:
     labels = np.full(values.shape, -1, dtype=np.int32)
     labels[labeled] = np.unique(values[labeled], return_inverse=True)[1]
     return torch.from_numpy(labels)
+
+
+def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
+    """Convert masks to a stack of label maps.
+
+    At each pixel, the first map has the index of the last mask that covers it, and each further map the index of the
+    previous one. Remaining entries are -1. The depth of the stack is the largest number of masks that share a pixel, at
+    least 1.
+    """
+    flat = masks.flatten(1)
+    depth = max(1, int(flat.sum(dim=0).max()))
+    labels = torch.full((depth, flat.shape[1]), -1, dtype=torch.int32, device=masks.device)
+    for columns in column_chunks(flat):
+        part = flat[:, columns].flip(0)
+        pixel, flipped = part.T.nonzero(as_tuple=True)  # by pixel, with the last mask of each pixel first
+        count = part.sum(dim=0)
+        layer = torch.arange(len(pixel), device=masks.device) - (count.cumsum(0) - count)[pixel]
+        labels[layer, columns.start + pixel] = (len(masks) - 1 - flipped).int()
+    return labels.reshape(depth, *masks.shape[1:])
+
+
+def column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
+    """Yield slices of columns that are small enough for a temporary array of M rows."""
+    step = min(2**24, max(1, _MASK_CHUNK[flat.device.type] // max(1, len(flat))))
+    return (slice(start, start + step) for start in range(0, flat.shape[1], step))

@@ -14,9 +14,8 @@ from importlib.util import find_spec
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any, get_args
 
-from normlift_ns.encoders.package_files import EDGES, PackageFile
 from normlift_ns.encoders.registry import encoder_kind, make_encoder, make_texts, with_encoder
-from normlift_ns.encoders.weights import find_local_sam
+from normlift_ns.encoders.weights import EDGES, PackageFile, find_local_sam
 from normlift_ns.errors import InputError
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, MASK_GROUP, FeatureKind, SourceOptions, short_repr
 from normlift_ns.registry import Registry
@@ -32,7 +31,7 @@ MASK_OPTIONS = ("sam_model", "sam_precision", "sam3_prompts", "regions_dir", "le
 class MaskSource:
     """A mask source, as registered by an entry point of the group `normlift_ns.masks`.
 
-    The module of an entry point should import torch only inside `make`, so that error messages stay fast.
+    The module of an entry point should import torch only inside `make`, so that errors are reported quickly.
 
     >>> from normlift_ns.segmentation.registry import MASK_SOURCES
     >>> MASK_SOURCES.load("files").options
@@ -40,7 +39,7 @@ class MaskSource:
     """
 
     make: Callable[[SourceOptions, str], Regions | FeatureSource]
-    """Function that makes the regions for options and a device such as "cuda". Weights should be loaded at first
+    """Function that makes the regions for options and a device such as "cuda". Weights should be loaded on first
     use."""
     check: Callable[[SourceOptions], None] = lambda options: None
     """Function that raises InputError or FileNotFoundError for unusable options, without importing torch."""
@@ -177,8 +176,8 @@ def _check_langsplat(options: SourceOptions) -> None:
         )
     if not encoder_kind(with_encoder(options).encoder).learned and options.text_embeddings is None:
         raise InputError(
-            f"--encoder {options.encoder} did not compute the features in {options.features_dir}; select the OpenCLIP "
-            "model that did with --encoder-model and --encoder-pretrained, or give --text-embeddings FILE"
+            f"--encoder {options.encoder} did not compute the features in {options.features_dir}; use --encoder-model "
+            "and --encoder-pretrained to select the OpenCLIP model that did, or give --text-embeddings FILE"
         )
 
 
@@ -230,8 +229,9 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
 def _preferred_regions(options: SourceOptions, device: str) -> list[str]:
     """Return the regions that "auto" can select for the encoder, in order of preference.
 
-    The result does not depend on the weights on this machine. On a CPU, it excludes SAM, and edges for encoders of
-    crops. Twelve crops through CLIP take longer than all patches of an image (`python -m research.edges --clip`).
+    The result does not depend on the weights on this machine. On a CPU, it excludes SAM. It also excludes edges if the
+    encoder can encode patches, but would encode each region as a crop. Twelve crops through CLIP take longer than all
+    patches of an image (`python -m research.edges --clip`).
     """
     kind, on_gpu = encoder_kind(options.encoder), device.startswith("cuda")
     if not kind.learned:

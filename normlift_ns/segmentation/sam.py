@@ -1,8 +1,8 @@
 """Automatic masks of SAM, SAM 2, SAM 2.1 and HQ-SAM.
 
-Images are resized like in Pillow, first along rows and then along columns, with weights of 22 bits and sums rounded to
-8 bits. This integer arithmetic below 2^31 gives the same result on all devices. Pillow 13 can start with the columns if
-the image loses rows and this is less work. Pixels then differ by at most one.
+Images are resized as in Pillow, first along rows and then along columns, with weights of 22 bits and sums rounded to 8
+bits. This integer arithmetic below 2^31 gives the same result on all devices. If an image is reduced in height and this
+is less work, Pillow 13 can start with the columns. Pixel values then differ by at most one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from normlift_ns.segmentation.checkpoint import (
     resolve_precision,
     sam_identity,
 )
-from normlift_ns.segmentation.regions import RegionDefaults
+from normlift_ns.segmentation.regions import RegionDefaults, stack_masks
 
 _BITS = 22
 
@@ -76,8 +76,8 @@ def _pillow_weights(size: int, new_size: int) -> tuple[Int64[Tensor, " n"], Int3
 # * All points share the embedding of the image until a layer has attended to the tokens, so it is not copied per point.
 # * Attention between tokens and image does not project the image. q . (W_k x) equals (W_k^T q) . x, and the mean of
 #   W_v x equals W_v times the mean of x. The matrices of each head are therefore applied to the tokens. Each position
-#   needs only two products with 56 columns, one per token and head. The bias of the keys is the same for all positions
-#   and cancels.
+#   needs only two products with 56 columns, one column per token and head. The bias of the keys is the same for all
+#   positions and cancels.
 # * Transposed 2 x 2 convolutions with stride 2 are matrix products. Pixels are reordered only once, at the end, when
 #   they consist of three logits each.
 # * The first of the four masks of a point is intended for several prompts, and is not computed.
@@ -115,7 +115,7 @@ class MaskDecoder:
 
         Args:
             image: Embedding of the image, one row per position, [N, C].
-            positioned: The same plus position embeddings, [N, C].
+            positioned: The same embedding plus position embeddings, [N, C].
             prompts: Two tokens per point, [P, 2, C].
         """
         decoder = self._model.mask_decoder
@@ -495,7 +495,7 @@ class HqSamNetwork(_LibraryNetwork):
         return list(zip(last.float().split(1), early[0].float().split(1)))
 
     def _predict(self, embedding: Any, points: Tensor) -> MaskPredictions:
-        """Predict masks in the order of the decoder, which the levels need.
+        """Predict masks in the order of the decoder, on which the levels depend.
 
         transformers sorts the three masks of a point by predicted IoU, so this method restores their order.
         """
@@ -596,7 +596,7 @@ class _Candidates(NamedTuple):
 
 @dataclass(frozen=True)
 class SamMasks(RegionDefaults):
-    """Regions from one level of SAM's automatic masks. Weights are loaded at first use.
+    """Regions from one level of SAM's automatic masks. Weights are loaded on first use.
 
     Raises:
         ValueError: If transformers is not installed, or the checkpoint is neither a path nor a hub name.
@@ -628,7 +628,7 @@ class SamMasks(RegionDefaults):
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         """Return label maps of the levels default, s, m and l, on the device. Raises the same errors as `masks`."""
-        maps = [mask_filtering.stack_masks(masks) for masks in self.masks(image).values()]
+        maps = [stack_masks(masks) for masks in self.masks(image).values()]
         depth = max(len(labels) for labels in maps)
         return torch.stack([pad(labels, (0, 0, 0, 0, 0, depth - len(labels)), value=-1) for labels in maps])
 
@@ -713,7 +713,7 @@ class SamMasks(RegionDefaults):
 
     @cached_property
     def network(self) -> PromptedNetwork:
-        """The network with its weights, loaded at first use. Raises the same errors as `masks`."""
+        """The network with its weights, loaded on first use. Raises the same errors as `masks`."""
         return load_sam_network(self.checkpoint, self.device, self.precision)
 
 

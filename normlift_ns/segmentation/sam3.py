@@ -29,8 +29,7 @@ from normlift_ns.segmentation.checkpoint import (
     resolve_precision,
     transformers_folder,
 )
-from normlift_ns.segmentation.mask_filtering import stack_masks
-from normlift_ns.segmentation.regions import RegionDefaults
+from normlift_ns.segmentation.regions import RegionDefaults, stack_masks
 
 SCORE_THRESHOLD = 0.5
 """Largest score of masks that are dropped, as in the model card.
@@ -83,10 +82,10 @@ class Sam3Network:
         with checkpoint_errors(path, "SAM 3"):
             folder = transformers_folder(path)
             if folder is None:
-                raise InputError("found a file, expected a folder with config.json, model.safetensors and a tokenizer")
+                raise InputError("it is a file, expected a folder with config.json, model.safetensors and a tokenizer")
             model = load_pretrained_sam(folder, read_sam_family(folder, TEXT_PROMPT_FAMILIES))
             if not any((folder / name).is_file() for name in ("tokenizer.json", "vocab.json")):
-                raise InputError("the folder has no tokenizer.json and no vocab.json with merges.txt")
+                raise InputError("the folder has neither tokenizer.json nor vocab.json with merges.txt")
             tokenizer = import_transformers().CLIPTokenizer.from_pretrained(folder, local_files_only=True)
         return cls(model, tokenizer, device, precision)
 
@@ -152,7 +151,7 @@ def sam3_identity(checkpoint: str, device: str, precision: SamPrecision = "auto"
 
 @dataclass(frozen=True)
 class Sam3Masks(RegionDefaults):
-    """Regions that SAM 3 predicts for text prompts, one per instance. Weights are loaded at first use.
+    """Regions that SAM 3 predicts for text prompts, one per instance. Weights are loaded on first use.
 
     If instances overlap, the lift uses the one with the higher score. Pixels without an instance are unlabeled.
 
@@ -185,5 +184,5 @@ class Sam3Masks(RegionDefaults):
 
     @cached_property
     def network(self) -> Sam3Network:
-        """The network with its weights, loaded at first use."""
+        """The network with its weights, loaded on first use."""
         return Sam3Network.load(self.checkpoint, self.device, self.precision)

@@ -61,7 +61,7 @@ _MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
 _TRIM_INTERVAL = 2.0
 _QUICK_THREADS = 4
 _THREADS = max(2, (os.cpu_count() or 2) // 2)
-"""Number of threads for queries, and of threads for slower work such as explanations; each uses several cores."""
+"""Number of threads for queries, and of those for slower work such as explanations. Each thread uses several cores."""
 _HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY, "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin",
@@ -148,7 +148,7 @@ class Guard:
 
 
 class _PromptProtocol(H11Protocol):
-    """HTTP protocol that closes connections whose requests do not arrive in time; uvicorn would wait for ever."""
+    """HTTP protocol that closes connections whose requests do not arrive in time; uvicorn would wait without limit."""
 
     _deadline: asyncio.TimerHandle | None = None
 
@@ -181,7 +181,7 @@ class _PromptProtocol(H11Protocol):
 
 
 def _limited(receive: Receive) -> Receive:
-    """Wrap `receive`: raise HTTPException if the body is too large, and TimeoutError if it arrives too slowly."""
+    """Wrap `receive` to raise HTTPException if the body is too large, and TimeoutError if it arrives too slowly."""
     total = 0
 
     async def limited() -> Message:
@@ -223,8 +223,8 @@ class WarmServer:
     """HTTP server of lifted runs, with the web page, its sessions and the HTTP API on one port.
 
     Args:
-        runs: store of the runs.
-        options: address, port and write access.
+        runs: Store of the runs.
+        options: Address, port and write access.
     """
 
     def __init__(self, runs: RunStore, options: ServerOptions) -> None:
@@ -245,7 +245,7 @@ class WarmServer:
         """Return the ASGI application.
 
         Args:
-            extra_routes: routes in addition to those of the page and the API.
+            extra_routes: Routes in addition to those of the page and the API.
             lifespan: Starlette lifespan context of the application.
         """
         routes = [
@@ -270,7 +270,7 @@ class WarmServer:
         """Return the run with the id `name`, and open it if necessary.
 
         Raises:
-            HTTPException: no run has this id (status 404).
+            HTTPException: No run has this id (status 404).
         """
         if name not in self.runs.ids:
             raise HTTPException(404, f"There is no run {name[:80]!r}. Choose one of: {', '.join(self.runs.ids)}.")

@@ -125,7 +125,7 @@ Part = RemoteAnswer | RemoteFinding | Bool[Tensor, " n"]
 
 @dataclass(eq=False, repr=False)
 class RemoteRun:
-    """Lifted run on a server, with methods like those of `LiftedRun`. They may be called from any thread.
+    """Lifted run on a server, with methods like those of `LiftedRun`. Any thread may call the methods.
 
     >>> from normlift_ns import connect, open_run
     >>> from normlift_ns.server.app import ServerOptions, WarmServer
@@ -167,8 +167,8 @@ class RemoteRun:
         """Compute the relevancy and the selection of every Gaussian for each prompt, as `LiftedRun.ask` does.
 
         Raises:
-            ValueError: the server rejects the query, for instance because the encoder cannot encode a prompt.
-            OSError: the server does not respond.
+            ValueError: The server rejects the query, for instance because the encoder cannot encode a prompt.
+            OSError: The server does not respond.
         """
         arrays: Arrays = "safetensors"
         settings = (None if negatives is None else list(negatives), relevancy, threshold, min_reliability, refined)
@@ -184,7 +184,7 @@ class RemoteRun:
         return msgspec.json.decode(self._post("objects", _selection(part)), type=ObjectsResult)
 
     def select(self, part: Part | Selection) -> SelectResult:
-        """Return the number, center and box of the selected Gaussians, for instance of `Selection(ray=…)`."""
+        """Return the number, center and box of the selected Gaussians, for instance for `Selection(ray=…)`."""
         return msgspec.json.decode(self._post("select", _selection(part)), type=SelectResult)
 
     @check_arguments
@@ -238,7 +238,7 @@ class RemoteRun:
         """Write the Gaussians of `part` (default: the whole scene) to a PLY file on this machine.
 
         Raises:
-            FileExistsError: the file exists and `overwrite` is False.
+            FileExistsError: The file exists and `overwrite` is False.
         """
         path = check_path("path", path)
         refuse_inputs([path], instead="name")
@@ -365,12 +365,12 @@ def connect(url: str, run: str | None = None, *, access_token: str = "") -> Remo
     """Connect to a run on a server that was started with ns-normlift-serve or ns-normlift-view.
 
     Args:
-        url: address of the server, such as http://localhost:7008.
-        run: id of the run (default: the only run of the server).
-        access_token: token printed by the server; needed to store prompts from another machine.
+        url: Address of the server, such as http://localhost:7008.
+        run: Id of the run (default: the only run of the server).
+        access_token: Token printed by the server; needed to store prompts from another machine.
     Raises:
-        ValueError: the address is not valid, or the server does not have this run.
-        OSError: the server does not respond.
+        ValueError: The address is not valid, or the server does not have this run.
+        OSError: The server does not respond.
 
     >>> try:
     ...     connect("ftp://localhost")

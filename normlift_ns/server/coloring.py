@@ -37,7 +37,7 @@ class Codes(NamedTuple):
     """Colors of M drawn Gaussians: a palette, and the index of each Gaussian in it."""
 
     palette: list[tuple[int, int, int, float, int]]
-    """Red, green and blue in 0..255, opacity of this color, and 1 if it is mixed with gray, 0 with the trained color.
+    """Red, green and blue in 0..255, the opacity of this color, and the color under it (0: trained color, 1: gray).
     """
     codes: UInt8[np.ndarray, " m"]
 
@@ -46,8 +46,8 @@ def make_codes(state: State, rows: np.ndarray, pca: Float[torch.Tensor, "n 3"] |
     """Return the colors of the drawn Gaussians.
 
     Args:
-        rows: indices of the drawn Gaussians in the scene.
-        pca: principal components of all Gaussians, in 0..1; needed for the color mode pca.
+        rows: Indices of the drawn Gaussians in the scene.
+        pca: Principal components of all Gaussians, in 0..1; needed for the color mode pca.
     """
     table: list[tuple[int, int, int, float, int]] = [(0, 0, 0, 0.0, 0), (0, 0, 0, 0.0, 1)]
     codes = np.full(len(rows), _OWN)

@@ -29,14 +29,14 @@ _MAX_HISTOGRAMS = 8
 _MAX_IMAGES = 3
 """Maximum number of images with the largest weight, and of images with the largest disagreement, in an explanation."""
 _IMAGE_SIZE = 480
-_OVER_VIEWS = "Based on about {:.0f} images; {}."
+_OVER_VIEWS = "Based on about {:.0f} images; the vote of neighboring Gaussians changed {:.0%} of the answers."
 
 
 def region_mask(served: ServedRun, state: State, value: protocol.Region | protocol.Brush) -> Bool[Tensor, " n"]:
     """Return the mask of the visible Gaussians whose centers lie in a region of a view.
 
     Raises:
-        ValueError: the camera is not valid, or the region contains no visible Gaussian.
+        ValueError: The camera is not valid, or the region contains no visible Gaussian.
     """
     camera, scene = value.camera.camera(), served.run.scene
     pixels, inside = project(scene.gaussians.means, camera)
@@ -58,8 +58,8 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
     """Return the content of the message `state`, and the listed objects.
 
     Args:
-        rows: indices of the drawn Gaussians in the scene.
-        details: include objects and histograms, which takes longer.
+        rows: Indices of the drawn Gaussians in the scene.
+        details: Include objects and histograms, which takes longer.
     """
     selection, answer, query = state.selection, state.answer, state.query
     content: dict[str, Any] = {
@@ -149,10 +149,10 @@ def describe_hover(
 
 
 def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
-    """Return the images with the largest weight and the largest disagreement, as the message `explanation`.
+    """Return the content of the message `explanation`: the images with the largest weight and disagreement.
 
     Raises:
-        ValueError: nothing is selected, or the votes of the images are no longer in the cache.
+        ValueError: Nothing is selected, or the votes of the images are no longer in the cache.
     """
     with served.reading:
         votes = served.run.votes
@@ -170,7 +170,6 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
         facts = {"share": vote.share, "agreement": vote.agreement, "disagreement": vote.disagreement}
         return {"name": votes.names[vote.view], "url": images.get(vote.view), "regions": len(vote.regions), **facts}
 
-    smoothed = f"{why.copied / why.gaussians:.0%} of the Gaussians copied the feature of a neighbor"
     facts = {"agreement": why.c_inter, "effective_views": why.n_eff, "problem": problem}
     votes_of = {name: [entry(vote) for vote in group] for name, group in groups.items()}
-    return {"text": _OVER_VIEWS.format(max(1.0, why.n_eff), smoothed), **facts, **votes_of}
+    return {"text": _OVER_VIEWS.format(max(1.0, why.n_eff), why.changed), **facts, **votes_of}

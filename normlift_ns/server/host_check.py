@@ -24,10 +24,10 @@ def accepted_names(host: str, allowed_hosts: Sequence[str] = ()) -> frozenset[st
     """Return the host names that a server accepts; "" stands for all addresses of this machine.
 
     Args:
-        host: address that the server listens on.
-        allowed_hosts: additional names, such as the name of a proxy.
+        host: Address that the server listens on.
+        allowed_hosts: Additional names, such as the name of a proxy.
     Raises:
-        ValueError: an entry of `allowed_hosts` is not a host name or address.
+        ValueError: An entry of `allowed_hosts` is not a host name or address.
 
     >>> sorted(accepted_names("192.168.0.7", ["Splats.example.org"]))
     ['127.0.0.1', '192.168.0.7', '::1', 'localhost', 'splats.example.org']
@@ -51,9 +51,9 @@ def refuse_request(hosts: Sequence[str], origins: Sequence[str], names: frozense
     """Return the reason to reject a request; None if the server accepts it.
 
     Args:
-        hosts: values of the Host headers.
-        origins: values of the Origin headers, which only browsers send.
-        names: result of `accepted_names`.
+        hosts: Values of the Host headers.
+        origins: Values of the Origin headers, which only browsers send.
+        names: Result of `accepted_names`.
 
     >>> names = accepted_names("127.0.0.1")
     >>> refuse_request(["localhost:8000"], ["http://localhost:8000"], names)

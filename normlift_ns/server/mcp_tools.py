@@ -123,8 +123,8 @@ class Tools:
         object_number: ObjectNumber = None,
         format: Annotated[str, Field(description="ply, or masks for a ZIP file of mask images")] = "ply",
     ) -> str:
-        """Write the Gaussians that match prompts, or one object of them, to a new file in the export folder of the
-        server, and return the file name. Existing files are never replaced."""
+        """Write the Gaussians that match prompts, or one of the matching objects, to a new file in the export folder of
+        the server, and return the file name. Existing files are never replaced."""
         if self._export_dir is None:
             raise InputError("This server does not export files. Start it with --export-dir.")
         request = schema.ExportRequest(_question(prompts), object=object_number, format=format)
@@ -153,7 +153,7 @@ def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
     """Return an MCP server for the runs of a server.
 
     Args:
-        export_dir: folder that the tool export writes to; None to omit this tool.
+        export_dir: Folder that the tool export writes to; None to omit this tool.
     """
     mcp = MCPServer("normlift", instructions=_INSTRUCTIONS, version=normlift_ns.__version__, log_level="ERROR")
     tools = Tools(server, export_dir)

@@ -14,7 +14,7 @@ import torch
 
 from normlift_ns.core.gaussians import Camera, facing_pose
 from normlift_ns.errors import InputError
-from normlift_ns.session.prompts import join_prompts
+from normlift_ns.query.question import join_prompts
 from normlift_ns.session.state import State
 
 MAX_LINK_LENGTH = 6000
@@ -80,7 +80,7 @@ def link_of(state: State, clicks: Mapping[str, int], view: PageView | None) -> L
     """Return the link to a state and a camera.
 
     Args:
-        clicks: indices of clicked Gaussians, by the prompt texts that stand for the clicks.
+        clicks: Indices of clicked Gaussians, by the prompt texts that stand for the clicks.
     """
     query = state.query
     if query is None:
@@ -94,7 +94,7 @@ def write_link(link: Link) -> str:
     """Encode a link as the query string of a URL.
 
     Raises:
-        ValueError: the link is too long.
+        ValueError: The link is too long.
 
     >>> read_link(write_link(Link("red, blue"))).prompts
     'red, blue'
@@ -111,7 +111,7 @@ def read_link(query: str) -> Link | None:
     """Decode the link in the query string of a URL; return None if there is no link.
 
     Raises:
-        ValueError: the link is truncated or damaged.
+        ValueError: The link is truncated or damaged.
     """
     text = next((part[2:] for part in query.removeprefix("?").split("&") if part.startswith("q=")), None)
     if text is None:

@@ -114,7 +114,7 @@ class LayerVisibility(LayerName, frozen=True):
 
 
 class Export(msgspec.Struct, frozen=True):
-    """Download of the selection or of an object."""
+    """Request to download the selection or an object."""
 
     format: Annotated[str, msgspec.Meta(max_length=20)] = "ply"
     object: Count | None = None
@@ -161,7 +161,7 @@ def read_value(message: Message) -> Any:
     """Decode the value of a message.
 
     Raises:
-        ValueError: the action is unknown, or its value is not valid.
+        ValueError: The action is unknown, or its value is not valid.
     """
     if message.action not in VALUES:
         raise InputError(f"The server does not support the action {message.action[:40]!r}. Reload the page.")
@@ -173,7 +173,7 @@ def decode(text: str | bytes | msgspec.Raw, kind: Any) -> Any:
     """Decode JSON to the type `kind`.
 
     Raises:
-        ValueError: the JSON is malformed or does not match the type.
+        ValueError: The JSON is malformed or does not match the type.
     """
     try:
         return msgspec.json.decode(text, type=kind)

@@ -30,14 +30,14 @@ from normlift_ns.io.memory import free_memory
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.query.engine import run_query
-from normlift_ns.query.question import Query, load_query
+from normlift_ns.query.question import Query, join_prompts, load_query
 from normlift_ns.query.text_encoder import encoder_name, own_words
 from normlift_ns.rasterization.rasterize import ray_weights, render
 from normlift_ns.server.coloring import NOT_DRAWN, Codes, pca_of
 from normlift_ns.server.permalink import PageView
 from normlift_ns.session.objects import LookAtTarget, ObjectRow, unoccluded_viewpoint
 from normlift_ns.session.outputs import selection_bytes, store_query
-from normlift_ns.session.prompts import build_query, encode_prompts, join_prompts, prompts_of_query
+from normlift_ns.session.prompts import build_query, encode_prompts, prompts_of_query
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import History, State
 
@@ -52,7 +52,7 @@ _FIELDS_OF_VIEW = (0.3, 1.9)
 _GRAY_WEIGHTS, _GRAY_DIMMING = (0.3, 0.59, 0.11), 0.8
 _JPEG_QUALITY = 85
 _POSITION_STEP = 2**-14
-"""Steps to which the positions on the page are rounded, as a fraction of the radius of the scene."""
+"""Rounding step of the positions on the page, as a fraction of the radius of the scene."""
 _MEMORY_SHARE = 0.5
 """Default fraction of the free memory that open runs may use."""
 _render_lock = threading.Lock()
@@ -87,7 +87,7 @@ class ServedRun:
     """Open run, shared by all pages and requests.
 
     Args:
-        max_gaussians: maximum number of Gaussians to draw; large and opaque ones have priority.
+        max_gaussians: Maximum number of Gaussians to draw; large and opaque ones have priority.
     """
 
     id: str
@@ -169,7 +169,7 @@ class ServedRun:
 
     @cached_property
     def examples(self) -> list[str]:
-        """Words of the encoder's vocabulary that are found in different parts of the scene; [] without vocabulary."""
+        """Words of the encoder's vocabulary that are found in different parts of the scene; [] without a vocabulary."""
         color = encoder_name(self.run.field) == "color"
         words = _BASIC_COLORS if color else tuple(own_words(self.run.field))
         if len(words) == 0:
@@ -233,7 +233,7 @@ class ServedRun:
         """Return the vectors of stored prompts and of clicks, which do not need an encoder.
 
         Raises:
-            ValueError: a click refers to a Gaussian that this scene does not have.
+            ValueError: A click refers to a Gaussian that this scene does not have.
         """
         for name, gaussian in clicks.items():
             if gaussian >= len(self.space):
@@ -256,7 +256,7 @@ class ServedRun:
         """Return the cached result for a key, and compute it if necessary; the most recently used results are kept.
 
         Args:
-            size: function that returns the size of a result in bytes.
+            size: Function that returns the size of a result in bytes.
         """
         with self._memory_lock:
             found = self._results.pop(key, None)
@@ -276,8 +276,8 @@ class ServedRun:
         """Return a camera that looks at an object or a point from a position without occlusion.
 
         Args:
-            view: current camera; None for that of the first training image.
-            drawn: mask of the Gaussians that are drawn.
+            view: Current camera; None for that of the first training image.
+            drawn: Mask of the Gaussians that are drawn.
         Raises:
             ValueError: `view` is None, and the run has no training images.
         """
@@ -359,13 +359,13 @@ def to_jpeg(image: UInt8[np.ndarray, "h w 3"], max_size: int | None = None) -> b
 
 
 class RunStore:
-    """Store of runs by id. It opens runs at first use, and closes the least recently used ones above a memory limit.
+    """Store of runs by id. It opens runs on first use, and closes the least recently used ones above a memory limit.
 
     Args:
-        configs: paths of the runs' config.yml files.
-        open_run: function that opens the run of a config.yml.
-        max_gaussians: as in `ServedRun`.
-        memory_limit: maximum size of all open runs in bytes (default: half of the free memory).
+        configs: Paths of the runs' config.yml files.
+        open_run: Function that opens the run of a config.yml.
+        max_gaussians: As in `ServedRun`.
+        memory_limit: Maximum size of all open runs in bytes (default: half of the free memory).
     """
 
     def __init__(
@@ -398,7 +398,7 @@ class RunStore:
         """Return the run with the id `name`, and open it if necessary.
 
         Raises:
-            ValueError: no run has this id, or the run cannot be opened.
+            ValueError: No run has this id, or the run cannot be opened.
         """
         if name not in self._configs:
             raise InputError(f"There is no run {name!r}. Choose one of: {', '.join(self.ids)}.")

@@ -12,7 +12,7 @@ import torch
 from normlift_ns.errors import InputError
 from normlift_ns.options import RelevancyRule
 from normlift_ns.query.engine import Answer
-from normlift_ns.query.question import Query
+from normlift_ns.query.question import Query, join_prompts
 from normlift_ns.server.coloring import ColorMode
 from normlift_ns.server.describe import region_mask
 from normlift_ns.server.permalink import Finite, PageView
@@ -20,7 +20,7 @@ from normlift_ns.server.protocol import CameraValue, Ray, Region
 from normlift_ns.server.runs import ServedRun
 from normlift_ns.session import actions
 from normlift_ns.session.objects import ObjectRow, list_objects
-from normlift_ns.session.prompts import build_query, encode_prompts, join_prompts
+from normlift_ns.session.prompts import build_query, encode_prompts
 from normlift_ns.session.state import State
 
 Prompt = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
@@ -57,9 +57,9 @@ class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     object: Annotated[int, msgspec.Meta(ge=1)] | None = None
     """Number of an object to select, from the response of /objects to the same question."""
     ray: Ray | None = None
-    """Ray to select the object that it hits."""
+    """Ray that selects the object that it hits."""
     region: Region | None = None
-    """Polygon in an image to select the visible Gaussians inside it."""
+    """Polygon in an image; the visible Gaussians inside it are selected."""
     floaters: bool = False
     """Select the likely floaters."""
     mask: Annotated[bytes, msgspec.Meta(max_length=2**22)] | None = None
@@ -86,7 +86,7 @@ class SaveRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     question: Question
     replace: bool = True
-    """Replace the prompts stored in the run; False: add the new prompts to them."""
+    """True to replace the prompts stored in the run, False to add the new prompts to them."""
 
 
 class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -207,7 +207,7 @@ def encode_question(served: ServedRun, question: Question) -> tuple[tuple[Any, .
     """Encode a question, and return its prompts and the query.
 
     Raises:
-        ValueError: the encoder cannot encode a prompt.
+        ValueError: The encoder cannot encode a prompt.
     """
     settings = {"negatives": question.negatives, "relevancy": question.relevancy, "threshold": question.threshold}
     settings |= {"min_reliability": question.min_reliability, "refined": question.refined}
@@ -248,7 +248,7 @@ def select_state(served: ServedRun, selection: Selection) -> State:
     """Return a state with the requested selection.
 
     Raises:
-        ValueError: the selection is not valid, or its object, ray or region contains no Gaussians.
+        ValueError: The selection is not valid, or its object, ray or region contains no Gaussians.
     """
     state = State(served.space, color_mode="overlay")
     if selection.question is not None:
@@ -268,10 +268,10 @@ def select_state(served: ServedRun, selection: Selection) -> State:
 
 
 def find_object(state: State, number: int) -> ObjectRow:
-    """Return the object with this number in the list of objects, from 1.
+    """Return the object with this number in the list of objects; numbers start at 1.
 
     Raises:
-        ValueError: the list has no object with this number.
+        ValueError: The list has no object with this number.
     """
     objects = list_objects(state, max_objects=MAX_OBJECTS).objects
     if number > len(objects):
@@ -288,7 +288,7 @@ def unpack_mask(packed: bytes, count: int) -> torch.Tensor:
     """Unpack the mask of `count` Gaussians.
 
     Raises:
-        ValueError: the number of bytes does not match the number of Gaussians.
+        ValueError: The number of bytes does not match the number of Gaussians.
 
     >>> unpack_mask(pack_mask(torch.tensor([True, False, True])), 3).tolist()
     [True, False, True]

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.errors import InputError, describe_error
+from normlift_ns.query.question import join_prompts
 from normlift_ns.server import protocol
 from normlift_ns.server.coloring import COLOR_MODES, Codes, make_codes
 from normlift_ns.server.describe import (
@@ -33,14 +34,7 @@ from normlift_ns.server.permalink import Greeting, Link, PageView, link_of, read
 from normlift_ns.server.runs import PageMemory, ServedRun, without_paths
 from normlift_ns.session import actions
 from normlift_ns.session.objects import LookAtTarget, ObjectRow
-from normlift_ns.session.prompts import (
-    build_query,
-    click_name,
-    encode_prompts,
-    is_click,
-    join_prompts,
-    not_understood,
-)  # fmt: skip
+from normlift_ns.session.prompts import build_query, click_name, encode_prompts, is_click, not_understood
 from normlift_ns.session.state import RequestTokens, State
 
 _MAX_PENDING = 256

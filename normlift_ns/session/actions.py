@@ -14,9 +14,9 @@ from torch import Tensor
 from normlift_ns.errors import InputError
 from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Finding, Histogram
-from normlift_ns.query.question import Query
+from normlift_ns.query.question import Query, join_prompts
 from normlift_ns.rendering.colors import RGB, clip_text, prompt_rgb_tuples
-from normlift_ns.session.prompts import Prompt, is_click, join_prompts
+from normlift_ns.session.prompts import Prompt, is_click
 from normlift_ns.session.state import Layer, State
 
 
@@ -31,14 +31,14 @@ class PromptDiagnostics:
     histogram: Histogram
     """Histogram of its relevancies."""
     warning: str
-    """Warning about the prompt, or an empty string. The warning lists the words that the encoder uses, if it ignores
-    other words. If the prompt is not found or selects no Gaussian, it describes the nearest match."""
+    """Warning about the prompt, or an empty string. If the encoder ignores some words, the warning lists those that it
+    uses. If the prompt is not found or selects no Gaussian, the warning describes the nearest match."""
     nearest_position: tuple[float, float, float] | None = None
     """Position of the nearest match, if there is a warning."""
 
 
 def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagnostics, ...]:
-    """Return diagnostics of the first `max_prompts` prompts that select Gaussians, or () for a selection by hand."""
+    """Return diagnostics of the first `max_prompts` prompts of the query, or () for a selection made by hand."""
     answer = state.answer
     if answer is None or not state.prompts_select:
         return ()
@@ -82,7 +82,7 @@ def threshold_suggestion(state: State) -> float | None:
 def carry_threshold(state: State, question: Query) -> Query:
     """Return `question` with the threshold of the previous query, if both use the same rule.
 
-    If `question` uses the suggested threshold, the previous threshold replaces it only if the user chose that one.
+    If `question` uses the suggested threshold, it gets the previous threshold only if the user chose that threshold.
     """
     previous = state.query
     if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):
@@ -118,10 +118,10 @@ def ask(state: State, prompts: Sequence[Prompt], question: Query | None) -> Stat
     """Apply a new query. Hidden Gaussians stay hidden; clicked selections are dropped.
 
     Args:
-        prompts: all rows, from `build_query`.
-        question: query of these rows, from `build_query`; None if no row has a vector, so that nothing is selected.
+        prompts: All rows, from `build_query`.
+        question: Query of these rows, from `build_query`; None if no row has a vector, so that nothing is selected.
     Raises:
-        ValueError: the vectors have a different dimension than the field.
+        ValueError: The vectors have a different dimension than the field.
     """
     did = f"Ask {join_prompts([prompt.text for prompt in prompts])}"
     return _with_suggested_threshold(replace(_unasked(state), prompts=tuple(prompts), query=question, action=did))
@@ -163,7 +163,7 @@ def use_suggested_threshold(state: State) -> State:
     """Set the threshold that the relevancies of the selecting prompts suggest.
 
     Raises:
-        ValueError: there is no query.
+        ValueError: There is no query.
     """
     value = threshold_suggestion(state)
     if value is None:
@@ -186,10 +186,10 @@ def remove_weak(state: State) -> State:
 
 
 def show_prompt(state: State, shown: int | None) -> State:
-    """Select by only one prompt of the query.
+    """Let only one prompt of the query, or all prompts, select Gaussians.
 
     Args:
-        shown: index of the prompt; None for all prompts.
+        shown: Index of the prompt; None for all prompts.
     """
     count = 0 if state.query is None else len(state.query.texts)
     if shown == state.shown or (shown is not None and not 0 <= shown < count):
@@ -204,10 +204,10 @@ def set_color_mode(state: State, name: str) -> State:
 
 
 def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
-    """Return the index of the drawn Gaussian with a direction that has the largest weight on a ray.
+    """Return the index of the Gaussian with the largest weight on a ray, among drawn Gaussians with a direction.
 
     Raises:
-        ValueError: the ray hits no such Gaussian.
+        ValueError: The ray hits no such Gaussian.
     """
     weights = weights.where(state.space.field.valid(refined=state.refined) & state.drawn, 0.0)
     index = int(weights.argmax()) if len(weights) > 0 else 0
@@ -239,7 +239,7 @@ def click(state: State, weights: Float[Tensor, " n"], mode: ClickMode = "select"
     """Select, add or remove the clicked object; see `object_under`.
 
     Args:
-        weights: weights of the Gaussians on the ray of the click, as from `rasterization.rasterize.ray_weights`.
+        weights: Weights of the Gaussians on the ray of the click, from `rasterization.rasterize.ray_weights`.
     """
     return change_objects(state, object_under(state, pick_gaussian(state, weights)), mode)
 
@@ -256,7 +256,7 @@ def change_selection(state: State, mask: Bool[Tensor, " n"], mode: ClickMode, wh
     """Select Gaussians, add them to the selection, or remove them from it.
 
     Args:
-        what: description of the Gaussians for the history.
+        what: Description of the Gaussians for the history.
     """
     change = {"select": select, "add": add, "remove": remove}[mode]
     return change(state, mask, f"{mode.capitalize()} {what}")
@@ -266,7 +266,7 @@ def picked_direction(state: State, weights: Float[Tensor, " n"]) -> Float[np.nda
     """Return the direction of the clicked Gaussian, which is the vector of a prompt named `click_name(...)`.
 
     Args:
-        weights: weights of the Gaussians on the ray of the click.
+        weights: Weights of the Gaussians on the ray of the click.
     """
     row = torch.tensor([pick_gaussian(state, weights)], device=state.space.means.device)
     return state.space.field.directions(row, refined=state.refined)[0].cpu().numpy()
@@ -279,7 +279,7 @@ def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> Sta
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
-    """Add Gaussians to the selection. After growing or shrinking, it no longer depends on prompts."""
+    """Add Gaussians to the selection. If it was grown or shrunk, the new selection no longer depends on prompts."""
     if state.grow_steps != 0:
         return replace(select(state, state.selection | chosen, did), additions=state.additions)
     removed = None if state.removed is None else state.removed & ~chosen
@@ -288,7 +288,7 @@ def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
 
 
 def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Remove") -> State:
-    """Remove Gaussians from the selection. After growing or shrinking, it no longer depends on prompts."""
+    """Remove Gaussians from the selection. If it was grown or shrunk, the new one no longer depends on prompts."""
     additions = tuple(mask for one in state.additions if bool((mask := one & ~chosen).any()))
     if state.grow_steps != 0:
         return replace(select(state, state.selection & ~chosen, did), additions=additions)
@@ -305,9 +305,9 @@ def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
     """Select likely floaters.
 
     Args:
-        floaters: mask of the floaters, from `analysis.objects.find_floaters`.
+        floaters: Mask of the floaters, from `analysis.objects.find_floaters`.
     Raises:
-        ValueError: the mask is empty.
+        ValueError: The mask is empty.
     """
     if not bool(floaters.any()):
         raise InputError("The scene has no likely floaters.")
@@ -324,9 +324,9 @@ def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """Hide Gaussians in addition to those that are already hidden.
 
     Args:
-        chosen: mask of the Gaussians (default: the selection).
+        chosen: Mask of the Gaussians (default: the selection).
     Raises:
-        ValueError: the mask is empty.
+        ValueError: The mask is empty.
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
@@ -339,9 +339,9 @@ def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """Draw only these Gaussians, including hidden ones.
 
     Args:
-        chosen: mask of the Gaussians (default: the selection).
+        chosen: Mask of the Gaussians (default: the selection).
     Raises:
-        ValueError: the mask is empty.
+        ValueError: The mask is empty.
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
@@ -358,7 +358,7 @@ def add_layer(state: State, name: str) -> State:
     """Save the selection as a layer, and replace a layer with the same name.
 
     Raises:
-        ValueError: nothing is selected, the name is empty, or there are too many layers.
+        ValueError: Nothing is selected, the name is empty, or there are too many layers.
     """
     name = clip_text(name, 60)
     layers = tuple(layer for layer in state.layers if layer.name != name)
@@ -384,7 +384,7 @@ def find_layer(state: State, name: str) -> Layer:
     """Return the layer with this name.
 
     Raises:
-        ValueError: no layer has this name.
+        ValueError: No layer has this name.
     """
     layer = next((layer for layer in state.layers if layer.name == name), None)
     if layer is None:

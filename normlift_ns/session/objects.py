@@ -74,8 +74,8 @@ def list_objects(state: State, *, max_objects: int = 12, min_gaussians: int = OB
     """Return the objects among the selected and drawn Gaussians, for each prompt or for a selection made by hand.
 
     Args:
-        max_objects: maximum number of listed objects; the largest object of each prompt has priority.
-        min_gaussians: minimum number of Gaussians in an object; those in smaller components are only counted.
+        max_objects: Maximum number of listed objects; the largest object of each prompt has priority.
+        min_gaussians: Minimum number of Gaussians in an object; those in smaller components are only counted.
     """
     selected, answer = state.selection & state.drawn, state.answer
     if answer is None or not state.prompts_select:
@@ -111,7 +111,7 @@ def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size
 
 
 Position = tuple[float, float, float]
-"""x, y, z in scene units."""
+"""x, y and z in scene units."""
 _MAX_OCCLUSION = 0.25
 """Maximum mean opacity in front of the object for a clear view."""
 _FILL = 0.8
@@ -145,12 +145,12 @@ def unoccluded_viewpoint(
     Gaussians do not count as occluders.
 
     Args:
-        target: object or point to look at.
+        target: Object or point to look at.
         scene: Gaussians that may occlude the target.
-        drawn: mask of the Gaussians that are drawn (default: all).
-        camera_position: current position of the camera.
-        up: direction of the vertical.
-        field_of_view: field of view of the camera in radians.
+        drawn: Mask of the Gaussians that are drawn (default: all).
+        camera_position: Current position of the camera.
+        up: Direction of the vertical.
+        field_of_view: Field of view of the camera in radians.
     """
     first = viewpoint(target, camera_position, field_of_view)
     center = torch.tensor(target.center, dtype=torch.float64)
@@ -180,9 +180,9 @@ def viewpoint(
     """Return a camera position on the current side of an object, at a distance at which the object fills the image.
 
     Args:
-        target: object or point to look at.
-        camera_position: current position of the camera.
-        field_of_view: field of view of the camera in radians.
+        target: Object or point to look at.
+        camera_position: Current position of the camera.
+        field_of_view: Field of view of the camera in radians.
     """
     center = np.asarray(target.center)
     offset = np.asarray(camera_position, float) - center
@@ -213,7 +213,7 @@ def _candidates(position: np.ndarray, center: np.ndarray, up: np.ndarray) -> Ite
 def _occlusion(
     scene: GaussianScene, position: Float[Tensor, " 3"], center: Float[Tensor, " 3"], margin: float
 ) -> float:
-    """Return the opacity between a position and a center, excluding the last `margin` in front of the center."""
+    """Return the opacity between a position and a center, excluding a distance of `margin` in front of the center."""
     direction = center - position
     length = direction.norm().clamp(min=1e-12)
     before = (scene.means.double() - position) @ (direction / length) < length - margin

@@ -26,10 +26,10 @@ def store_query(folder: Path | None, query: Query | None, *, replaces: bool = Fa
     """Store prompts in a run, and return the number of stored prompts as text, such as "2 prompts".
 
     Args:
-        folder: folder of the field.
+        folder: Folder of the field.
         replaces: True to delete the prompts that the run already stores, False to keep them.
     Raises:
-        ValueError: there is no query or no folder, or as in `merge_queries`.
+        ValueError: There is no query or no folder, or `merge_queries` cannot merge the queries.
     """
     if query is None or folder is None:
         raise InputError("There is no query yet, so there are no prompts to save. Type a prompt and press Ask.")
@@ -42,7 +42,7 @@ def splat_bytes(splat: TrainedSplat, state: State, mask: Bool[Tensor, " n"], nam
     """Return the name and content of a PLY file of the Gaussians in `mask`, and their number.
 
     Raises:
-        ValueError: the mask has no Gaussian that a renderer draws.
+        ValueError: The mask has no Gaussian that a renderer draws.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{safe_file_name(name)}.ply"
@@ -56,10 +56,10 @@ def selection_bytes(
     """Return the name and content of a file of the Gaussians in `mask`.
 
     Args:
-        name: name of the selection.
-        kind: name of an exporter that writes one file, or "masks" for a ZIP file with a mask for each training image.
+        name: Name of the selection.
+        kind: Name of an exporter that writes one file, or "masks" for a ZIP file with a mask for each training image.
     Raises:
-        ValueError: the mask has no Gaussian that a renderer draws, or the exporter does not exist.
+        ValueError: The mask has no Gaussian that a renderer draws, or the exporter does not exist.
     """
     if not bool(mask.any()):
         raise InputError("Nothing is selected. First select the Gaussians to export.")

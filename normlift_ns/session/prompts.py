@@ -12,13 +12,12 @@ from jaxtyping import Float
 
 from normlift_ns.errors import InputError
 from normlift_ns.options import RelevancyRule
-from normlift_ns.query.question import Query, make_query
+from normlift_ns.query.question import Query, make_query, split_prompts
 from normlift_ns.query.text_encoder import HasManifest
 
 MAX_PROMPTS = 64
 CLICK_THRESHOLD = 0.9
 """Minimum cosine between the directions of a clicked Gaussian and a similar one."""
-_PROMPT = re.compile(r'\s*(?:"([^"]*)"|([^,;\n]*))\s*(?:[,;\n]|$)')
 _CLICK = re.compile(r"like (what was clicked|click \d+)")
 _CLICK_RULE = "Clicks need the rule cosine. Choose the rule cosine, or ask for clicks without other prompts."
 EncodeTexts = Callable[[Sequence[str]], Any]
@@ -54,38 +53,6 @@ def is_click(text: str) -> bool:
     (True, True, False)
     """
     return _CLICK.fullmatch(text) is not None
-
-
-def split_prompts(text: str) -> list[str]:
-    """Split a text into prompts at commas, semicolons and line breaks outside quotes; drop duplicates.
-
-    >>> split_prompts('red mug , bowl;;"salt, pepper"; bowl')
-    ['red mug', 'bowl', 'salt, pepper']
-    """
-    parts = (" ".join((quoted or bare).split()) for quoted, bare in _PROMPT.findall(text))
-    return list(dict.fromkeys(part for part in parts if part))
-
-
-def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
-    """Split every text of an option with `split_prompts`.
-
-    Raises:
-        ValueError: there are texts, but no prompts in them.
-    """
-    prompts = tuple(dict.fromkeys(prompt for text in texts for prompt in split_prompts(text)))
-    if len(texts) > 0 and len(prompts) == 0:
-        raise InputError(f"{name} has only separators, got {', '.join(map(repr, texts))}; give at least one prompt")
-    return prompts
-
-
-def join_prompts(texts: Sequence[str]) -> str:
-    """Join texts into a line that `split_prompts` splits into the same texts.
-
-    >>> join_prompts(["red mug", "salt, pepper"])
-    'red mug, "salt, pepper"'
-    """
-    lines = (" ".join(text.replace('"', " ").split()) for text in texts)
-    return ", ".join(f'"{line}"' if re.search("[,;]", line) else line for line in lines)
 
 
 def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any] | None = None) -> tuple[Prompt, ...]:
@@ -151,7 +118,7 @@ def build_query(
     Returns:
         The rows, with an error for each click if the rule is not cosine, and their query.
     Raises:
-        ValueError: no row has a vector, or as in `make_query`.
+        ValueError: no row has a vector, or an argument is not valid (see `make_query`).
     """
     rows = tuple(prompts)
     clicks = [prompt.is_click for prompt in rows if prompt.vector is not None]

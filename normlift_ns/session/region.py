@@ -66,7 +66,7 @@ def visible_gaussians(
     the surface by twice its largest standard deviation, or by 3 % of the depth if that is more.
 
     Args:
-        drawn: mask of the Gaussians that are drawn.
+        drawn: Mask of the Gaussians that are drawn.
     """
     small = camera.downscaled(_RENDER_SIZE / max(camera.width, camera.height))
     rows = (drawn & scene.drawable).nonzero().squeeze(1)

@@ -52,7 +52,7 @@ class SelectionContext:
         """Return the answer to a query, as `run_query` does; cache the relevancies of the last four queries.
 
         Raises:
-            ValueError: the vectors have a different dimension than the field, or negatives are missing.
+            ValueError: The vectors have a different dimension than the field, or negatives are missing.
         """
         negative = None if question.negative_embeddings is None else question.negative_embeddings.tobytes()
         key = (question.texts, question.embeddings.tobytes(), negative, question.rule, question.refined)
@@ -79,8 +79,8 @@ class SelectionContext:
         component of all Gaussians similar to this one.
 
         Args:
-            gaussian: index of the Gaussian.
-            selected: mask of the selection.
+            gaussian: Index of the Gaussian.
+            selected: Mask of the selection.
         """
         if not bool(selected[gaussian]):
             (direction,) = self.field.directions(torch.tensor([gaussian], device=self.means.device), refined=refined)
@@ -97,9 +97,9 @@ class SelectionContext:
         selection and similar to its mean direction. Their cosine is at least 0.95 for one step, and the limit decreases
         by 0.05 with each further step.
 
-        Shrinking keeps the Gaussians of each connected component whose graph distance to its middle is at most a
-        fraction of the largest distance. The fraction is 10/11 for one step, and decreases by 1/11 with each further
-        step. More steps of growing never remove a Gaussian, and more steps of shrinking never add one.
+        In each connected component, shrinking keeps the Gaussians whose graph distance to the middle of the component
+        is at most a fraction of the largest distance. The fraction is 10/11 for one step, and decreases by 1/11 with
+        each further step. More steps of growing never remove a Gaussian, and more steps of shrinking never add one.
         """
         if steps == 0 or not bool(selected.any()):
             return selected

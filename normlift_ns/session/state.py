@@ -13,9 +13,9 @@ from torch import Tensor
 
 from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Answer
-from normlift_ns.query.question import Query
+from normlift_ns.query.question import Query, join_prompts
 from normlift_ns.rendering.colors import Colormap
-from normlift_ns.session.prompts import Prompt, join_prompts
+from normlift_ns.session.prompts import Prompt
 from normlift_ns.session.selection import SelectionContext
 
 
@@ -164,7 +164,7 @@ class History(Generic[T]):
         """Append a new state, make it current, and drop undone states; do nothing if the state is already current.
 
         Args:
-            key: key to merge successive steps, such as those of a slider drag; None to keep them separate.
+            key: Key to merge successive steps, such as those of a slider drag; None to keep them separate.
         """
         if state is self.now:
             return self

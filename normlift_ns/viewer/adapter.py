@@ -46,7 +46,7 @@ def handle_in_order(server: Any) -> None:
 
     viser 0.2.7 passes each message to one of 32 threads. On a busy machine, a button press can therefore overtake the
     text typed before it, and one of two quick presses is lost. With this function, each message waits until the
-    previous message is handled, but at most half a second.
+    previous message is handled, but for at most half a second.
 
     Args:
         server: viser's server.
@@ -118,11 +118,11 @@ def _send_in_order(connection: Any) -> None:
 def add_button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable[[str, Any], None]) -> Any:
     """Add a row of buttons to a panel; an empty label takes no space.
 
-    This function works around an error in viser 0.2.7. viser ignores the button of a group that was pressed last, and
-    the first button before any press.
+    This function works around an error in viser 0.2.7. viser ignores a second press of the same button of a group, and
+    a press of its first button before any other press.
 
     Args:
-        pressed: function to call with the caption of the pressed button and viser's event.
+        pressed: Function to call with the caption of the pressed button and viser's event.
     """
     group = gui.add_button_group(label, options)
 

@@ -71,8 +71,8 @@ class Controller(ABC):
     called from any thread.
 
     Args:
-        session: session that the actions change.
-        explanation: explanation of the current selection.
+        session: Session that the actions change.
+        explanation: Explanation of the current selection.
     """
 
     reading_message: str
@@ -115,7 +115,7 @@ class Controller(ABC):
         """Carry out an action, and show any error in the panel.
 
         Args:
-            value: value of a slider or a choice, or row of an object.
+            value: Value of a slider or a choice, or row of an object.
             client: viser's handle of the user's browser.
         """
         self._guard(lambda: self._act(action, value, client))
@@ -131,7 +131,7 @@ class Controller(ABC):
         """Make a history current, and show its state.
 
         Args:
-            message: message to show with it.
+            message: Message to show with the state.
             answered: True if the selection is new and must be visible.
         """
 
@@ -283,7 +283,7 @@ class Controller(ABC):
                     self._do(state, message, answered=True)
 
     def _explain(self) -> None:
-        """Explain the selection by its training images; find them without the lock."""
+        """Explain the selection by training images, which are found without the lock."""
         state, reasons = self.history.now, self._reasons
         token = reasons.start(state)
         self.show_message("")
@@ -305,8 +305,8 @@ class Controller(ABC):
         """Start a query for all Gaussians similar to a clicked one.
 
         Args:
-            clicked: index or direction of the clicked Gaussian.
-            stored: prompt texts that are already in use, in addition to those of other clicks.
+            clicked: Index or direction of the clicked Gaussian.
+            stored: Prompt texts that are already in use, in addition to those of other clicks.
         """
         with self._lock:
             names = {*self._session.clicks, *stored}

@@ -70,8 +70,8 @@ class ActionWidgets:
 
     Args:
         gui: viser's `GuiApi`.
-        act: function to call with the actions of the user.
-        lock: lock to hold while `act` handles a change, so that no other thread can revert the change.
+        act: Function to call with the actions of the user.
+        lock: Lock to hold while `act` handles a change, so that no other thread can revert the change.
     """
 
     prompts: Any
@@ -189,7 +189,7 @@ class ObjectRows:
 
     Args:
         gui: viser's `GuiApi`.
-        act: function to call with an action and the row of its object as the value.
+        act: Function to call with an action and the row of its object as the value.
     """
 
     def __init__(self, gui: Any, act: Act) -> None:
@@ -230,9 +230,9 @@ def prompt_rows(
     """Return the lines of a Markdown table with the color and the numbers, or the error, of each prompt.
 
     Args:
-        headings: headings of the columns of numbers.
-        numbers: numbers by prompt, in the order of the query.
-        max_rows: maximum number of prompts in the table.
+        headings: Headings of the columns of numbers.
+        numbers: Numbers by prompt, in the order of the query.
+        max_rows: Maximum number of prompts in the table.
     """
     colors = dict(zip(numbers, prompt_rgb_tuples(tuple(numbers))))
     rows = [("", "prompt", *headings), ("---",) * (2 + len(headings))]
@@ -264,7 +264,7 @@ def histogram_svg(histogram: Histogram, color: Sequence[float]) -> str:
     threshold.
 
     Args:
-        color: color of the bars above the threshold, RGB in 0..1.
+        color: Color of the bars above the threshold, RGB in 0..1.
 
     >>> values = np.array([0.1] * 60 + [0.9] * 10)
     >>> from normlift_ns.query.engine import relevancy_histogram
@@ -310,7 +310,9 @@ def diagnostics_mdx(state: State) -> str:
         lines += [escape_mdx(clip_text(one.warning, 400))] * (one.warning != "")
     count = 0 if state.answer is None or state.shown is not None else len(state.answer.texts)
     if 0 < len(diagnostics) < count:
-        lines.append(f"{count - len(diagnostics)} more prompts are not shown. Choose one to see its histogram.")
+        more = count - len(diagnostics)
+        shown = "prompt is not shown. Choose it" if more == 1 else "prompts are not shown. Choose one"
+        lines.append(f"{more} more {shown} to see its histogram.")
     return "\n\n".join(lines)
 
 
@@ -343,8 +345,8 @@ def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refin
     If the images cannot be shown, for instance because features were passed from Python, the text gives the reason.
 
     Raises:
-        ValueError: nothing is selected, or the votes are not in the cache.
-        FileNotFoundError: an image that is needed to count the votes is missing.
+        ValueError: Nothing is selected, or the votes are not in the cache.
+        FileNotFoundError: An image that is needed to count the votes is missing.
     """
     why = votes.explain(selected.cpu(), refined=refined)
     heaviest, different = why.views[:MAX_EXPLAIN_IMAGES], why.most_different[:MAX_EXPLAIN_IMAGES]
@@ -378,7 +380,7 @@ class Explanation:
     """Explanation of the current selection of one user.
 
     Args:
-        votes: function that returns the votes of the run; it is called at the first explanation.
+        votes: Function that returns the votes of the run; it is called at the first explanation.
     """
 
     def __init__(self, votes: Callable[[], RecordedVotes]) -> None:
@@ -401,7 +403,7 @@ class Explanation:
         """Compute the explanation of a selection. This can take seconds, so call it without a lock, from any thread.
 
         Raises:
-            ValueError, FileNotFoundError: as in `explanation_mdx`, unless the request is stale.
+            ValueError, FileNotFoundError: The errors of `explanation_mdx`, unless the request is stale.
         """
         content = ""
         try:

@@ -1,19 +1,30 @@
 """The controlled benchmark: what damage is, that no damage is none, and that its shortcuts are exact."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 from normlift_ns import RefineConfig, lift, nearest_neighbors, rasterize_evidence, refine_variant
+from normlift_ns.evaluation.studies import variant_source
 from research import variants
 from research.accuracy import Bench
 from research.accuracy_report import METHODS, summarize
+from research.batched_votes import parts, voters_of
+from research.candidates import Candidate
 from research.damage import LADDER, STEPS, Damage, observe
-from research.report import Report
-from research.tests import quick
+from research.documents import read
+from research.features import LENGTHS, mask_features, orthogonal_words
+from research.geometry import Seen, geometry, spread
+from research.real_features import FOX, NOISE, Regions, real_features
+from research.report import RESULTS, Report
+from research.synthetic_scenes import PARTS, made_words
+from research.tests import ROOT, quick
 from research.tests.tiny import CLASSES, WORDS
-from tests.random_scenes import dense
+from tests.random_scenes import dense, generator
 
 
 def test_without_damage_cells_become_the_exact_masks(world):
@@ -106,3 +117,72 @@ def test_quick_accuracy_benchmark(tmp_path):
     assert values["ladder.few views.paper.miou"] > values["ladder.few views.none.miou"]
     assert values["ablation.paper.miou"] > values["ablation.norm_only.miou"]
     assert values["reliability.spearman_bins_mean"] > 0.7
+
+
+def test_statistics_have_the_geometry_that_is_documented():
+    expected = {"clip": (0.83, 0.64), "isotropic": (0.13, 0.10), "low contrast": (0.90, 0.85), "orthogonal": (0.26, 0)}
+    k, masks = 12, torch.arange(12).repeat(40)
+    mistakes = {}
+    for name, lengths in LENGTHS.items():
+        words = orthogonal_words(k) if name == "orthogonal" else made_words(k)
+        given = (masks, torch.full_like(masks, -1), 0.0)
+        rows = mask_features(words, *given, 1.2, lengths, generator(0)).view(40, k, -1)
+        upper = torch.triu_indices(40, 40, 1).unbind()
+        same = torch.einsum("vkd,wkd->vwk", rows, rows)[upper].mean()
+        other = torch.einsum("vkd,wld->vwkl", rows, rows)[upper][:, ~torch.eye(k, dtype=torch.bool)].mean()
+        assert (float(same), float(other)) == pytest.approx(expected[name], abs=0.015), name
+        loud = mask_features(words, *given, 2.5, lengths, generator(0))
+        mistakes[name] = float(((loud @ words.classes.T).argmax(1) != masks).float().mean())
+    assert all(0.25 < share < 0.5 for share in mistakes.values()), mistakes
+
+
+def test_votes_are_those_of_refine(world):
+    observed = observe(world, WORDS, LADDER["hard"], 0)
+    lifted, neighbors = lift(observed.evidence, observed.features), nearest_neighbors(world.scene.means, 9)
+    voters = voters_of(neighbors, world.truth, CLASSES)
+    (part,) = parts(lifted, voters, cosines=True)
+    for name in ("plain_knn", "norm_only", "support_only", "paper", "posterior"):
+        for delta in (0.0, 0.1):
+            vote = "posterior" if name == "posterior" else "paper"
+            config = RefineConfig(vote=vote, k=9, sigma_d=1.5, tau=0.95, gamma=0.4, delta=delta, prior=3.0)
+            expected = variant_source(
+                name, world.scene.means, lifted.directions, lifted.scalars, config, neighbors=neighbors
+            )
+            (source,) = part.sources([Candidate(name, sigma_d=1.5, delta=delta, prior=3.0)], 0.95, 0.4)
+            assert torch.equal(source, expected[voters.group[:, 0]].long()), (name, delta)
+
+
+def test_quick_grid(tmp_path):
+    flags = ("--rows", str(tmp_path / "rows.jsonl"))
+    command = [sys.executable, "-m", "research.grid", "--quick", *flags, "--minutes", "0"]
+    begun = subprocess.run([*command, "--output", tmp_path], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert begun.returncode == 1 and "no cell is done" in begun.stderr
+    values = quick("grid", tmp_path, *flags)
+    assert values["cells"]["value"] == 12 and any(key.startswith("decision.default.") for key in values)
+    assert quick("grid", tmp_path, *flags) == values  # from the rows
+
+
+def test_real_features_have_the_cosines_of_the_fox():
+    values = {key.removeprefix("fox."): x for key, x in read(RESULTS / "geometry.json").values.items()}
+    paired = {"two_things": "two_things.two_views", "twoparts": "thing.two_views",
+              "twoparts_one_view": "thing.one_view"}  # fmt: skip
+    measured = {key: values[paired.get(key, key)] for key in vars(FOX)}
+    assert measured == pytest.approx(vars(FOX), abs=5.1e-4, rel=2e-3)
+    things, views, words = 12, 40, orthogonal_words(12)
+    toward = normalize(torch.randn(views, 3, generator=generator(1)) + torch.tensor([0, 0, 1.5]), dim=1)
+    view, thing, part = (x.flatten() for x in torch.meshgrid(*map(torch.arange, (views, things, PARTS)), indexing="ij"))
+    angles = torch.rad2deg((toward @ toward.T).clamp(-1, 1).acos()).expand(things, -1, -1)
+    regions = Regions(view, thing, part, torch.full_like(view, -1))
+    features = real_features(words, regions, angles, 0.0, NOISE, generator(0))
+    home = torch.arange(len(view)).view(views, -1).T  # of every part one Gaussian
+    seen = Seen(home, features, toward.expand(len(home), -1, -1))
+    made = geometry(seen, {str(k): torch.arange(k * PARTS, (k + 1) * PARTS) for k in range(things)}, generator(0))
+    for key in (x for x in made if x.startswith(("drift.", "thing.", "two_things.two", "near", "far"))):
+        assert made[key] == pytest.approx(values[key], abs=0.04), key
+    cosines = (features @ words.classes.T).view(views, things * PARTS, things)
+    own = cosines[:, torch.arange(things * PARTS), thing[: things * PARTS]]
+    assert float(own.mean()) == pytest.approx(FOX.own, abs=0.02)
+    lifted = normalize(features.view(views, -1, 512).mean(0), dim=1) @ words.classes.T
+    assert spread(lifted[torch.arange(len(home)), thing[: len(home)]]) == pytest.approx(FOX.spread, abs=0.12)
+    wrong = cosines.mean(0).view(things, PARTS, things).mean(1).fill_diagonal_(-1).amax(1)
+    assert float(wrong.mean()) == pytest.approx(FOX.wrong, abs=0.04) and bool((wrong > 0.02).all())

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -12,7 +13,11 @@ from tests.examples import examples
 
 
 def straight(center: tuple[float, float, float], size: tuple[float, float, float]) -> OrientedBox:
-    return OrientedBox(np.array(center, float), np.array(size, float), np.eye(3))
+    return box(np.array(center, float), np.array(size, float), np.eye(3))
+
+
+def box(*arrays: np.ndarray) -> OrientedBox:
+    return OrientedBox(*(torch.from_numpy(x.copy()) for x in arrays))
 
 
 def test_intersections_that_are_known():
@@ -23,7 +28,7 @@ def test_intersections_that_are_known():
     assert box_iou(cube, straight((0.5, 0, 0), (1, 2, 2))) == pytest.approx(0.5)
     for away in (straight((2, 0, 0), (2, 2, 2)), straight((9, 0, 0), (2, 2, 2)), straight((0, 0, 0), (2, 2, 0))):
         assert box_iou(cube, away) == 0
-    eighth = OrientedBox(np.zeros(3), np.array([2.0, 2, 2]), Rotation.from_euler("z", 45, degrees=True).as_matrix())
+    eighth = box(np.zeros(3), np.array([2.0, 2, 2]), Rotation.from_euler("z", 45, degrees=True).as_matrix())
     assert intersection_volume(cube, eighth) == pytest.approx(2 * 8 * (2**0.5 - 1))  # a regular octagon, 2 high
     assert box_iou(straight((0, 0, 0), (0, 0, 0)), straight((0, 0, 0), (0, 0, 0))) == 0
 
@@ -33,13 +38,14 @@ def test_intersections_that_are_known():
 def test_intersection_is_that_of_sampling(seed):
     g = np.random.default_rng(seed)
     first, second = (
-        OrientedBox(
+        box(
             0.5 * g.normal(size=3), np.sort(0.5 + g.random(3))[::-1], Rotation.random(random_state=seed + i).as_matrix()
         )
         for i in range(2)
     )
-    points = (g.random((20000, 3)) - 0.5) * first.size @ first.axes + first.center
+    size, axes, center = (x.numpy() for x in (first.size, first.axes, first.center))
+    points = (g.random((20000, 3)) - 0.5) * size @ axes + center
     inside = (half_spaces(second) @ np.column_stack([points, np.ones(len(points))]).T <= 0).all(axis=0)
-    expected = inside.mean() * first.size.prod()
-    assert intersection_volume(first, second) == pytest.approx(expected, abs=0.02 * first.size.prod())
+    expected = inside.mean() * size.prod()
+    assert intersection_volume(first, second) == pytest.approx(expected, abs=0.02 * size.prod())
     assert intersection_volume(first, second) == pytest.approx(intersection_volume(second, first), rel=1e-6, abs=1e-9)

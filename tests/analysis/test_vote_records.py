@@ -40,12 +40,14 @@ def test_the_votes_are_those_of_the_lift(run: nl.LiftedRun) -> None:
         assert len(why.views) == int(run.field.scalars.view_count[j])
 
 
-def test_a_finding_is_explained_with_the_evidence_that_it_copied(run: nl.LiftedRun) -> None:
+def test_a_finding_is_explained_with_the_evidence_that_the_vote_gave_it(run: nl.LiftedRun) -> None:
     red = run.ask("red")["red"]
     why = run.why(red)
-    own = run.field.source.long() == torch.arange(len(run.field))
-    assert why.copied == int((red.mask & ~own).sum()) > 0
-    assert run.why(run.ask("red", refined=False)).copied == 0
+    own, used = (run.field.directions(red.mask.nonzero().squeeze(1), refined=x) for x in (False, True))
+    changed = float(((own * used).sum(dim=1) < 0.98).float().mean())
+    assert why.changed == pytest.approx(changed, abs=0.01)
+    assert 0 < why.changed < 1
+    assert run.why(run.ask("red", refined=False)).changed == 0
     assert why.c_inter > 0.9
     assert len(why.words) > 0
     with pytest.raises(nl.InputError, match="part "):

@@ -184,8 +184,20 @@ class OnPage(Person):
         self.until(lambda: self.page.evaluate("frames45.some((frame) => frame.unsorted !== null)"), "sorted again")
         self.page.evaluate("frames45.length = 0")
 
-    def frames(self) -> list[dict[str, float]]:
-        return self.page.evaluate("frames45")
+    def changes_quickly(self, pause: int) -> None:
+        """Makes 22 changes of the colors, faster than the scene is drawn; no frame is missing or unsorted."""
+        revision = self.page.evaluate("page.revision")
+        modes = [f"mode-{name}" for name in ("heat", "prompts", "rgb", "reliability", "pca", "overlay")]
+        names = "hide show invert invert undo redo undo grow shrink isolate show hide show theme"
+        for step in [*modes, *(f"do-{name}" for name in names.split()), "mode-rgb", "mode-overlay"]:
+            self.does(step)
+            self.page.wait_for_timeout(pause)
+        self.until(lambda: self.page.evaluate("page.revision") >= revision + 20, "changes")
+        self.calm()
+        frames = self.page.evaluate("frames45")
+        assert len(frames) >= 10
+        assert [frame for frame in frames if frame["splats"] != frames[0]["splats"] or frame["covered"] < 0.02] == []
+        assert [frame for frame in frames if (frame["unsorted"] or 0) > 0.002] == []
 
     def pointed(self, count: int = 100) -> tuple[int, int]:
         """Points at random places: how often the pointer tells what the server finds there with its own camera, and how

@@ -1,4 +1,4 @@
-"""A person before the page of ns-normlift-view: asks, selects, hides, explains, exports, and comes back."""
+"""A person before the page of ns-normlift-view, and before nerfstudio's viewer: asks, selects, exports, comes back."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from plyfile import PlyData
 
 from normlift_ns.query.question import load_query
 from tests.browser.page import OnPage
-from tests.browser.person import RED, YELLOW, changed, coloured, hue_mask, iou, middle, needs_chromium
+from tests.browser.person import ARMED, BLUE, RED, YELLOW, changed, coloured, hue_mask, iou, middle, needs_chromium
 from tests.browser.server import Server
+from tests.browser.viewer import HIDDEN, Tab, overlaid
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -332,32 +333,14 @@ def test_no_frame_is_missing_or_unsorted(page: OnPage) -> None:
     things(page)
     page.watch()
     page.page.evaluate("page.scene.spark.sortDelay = 500")
-    geometry = page.page.evaluate(
-        "performance.getEntriesByType('resource').filter((one) => one.name.includes('geometry')).length"
-    )
+    fetched = "performance.getEntriesByType('resource').filter((one) => one.name.includes('geometry')).length"
+    geometry = page.page.evaluate(fetched)
     page.ask("red, yellow")
-    revision = page.page.evaluate("page.revision")
-    modes = ("heat", "prompts", "rgb", "reliability", "pca", "overlay")
-    names = "hide show invert hide show undo undo redo grow shrink isolate show theme theme"
-    steps = [*(f"mode-{mode}" for mode in modes), *(f"do-{name}" for name in names.split()), "mode-heat", "mode-rgb"]
     threshold = page.state("threshold")
     for _ in range(4):
         page.page.locator("#threshold").press("ArrowRight")
-    for step in steps:
-        page.does(step)
-        page.page.wait_for_timeout(150)
-    page.until(lambda: page.page.evaluate("page.revision") >= revision + len(steps) - 4, "changes")
-    page.calm()
-    frames = page.frames()
-    assert len(frames) > 10
-    assert min(frame["splats"] for frame in frames) == max(frame["splats"] for frame in frames)
-    assert max(frame["unsorted"] for frame in frames) < 0.002 and min(frame["covered"] for frame in frames) > 0.02
-    assert (
-        page.page.evaluate(
-            "performance.getEntriesByType('resource').filter((one) => one.name.includes('geometry')).length"
-        )
-        == geometry
-    )
+    page.changes_quickly(150)
+    assert page.page.evaluate(fetched) == geometry
     assert min(page.measured("colors")) <= 150
     assert page.state("threshold") > threshold
     before = page.page.evaluate("page.revision")
@@ -365,3 +348,70 @@ def test_no_frame_is_missing_or_unsorted(page: OnPage) -> None:
     page.until(lambda: page.page.evaluate("page.revision") > before and page.page.locator("#busy").is_hidden(), "done")
     assert page.state("threshold") == threshold  # that of the question before is not carried over
     assert re.fullmatch(r"\d\.\d\d", page.page.locator("#threshold-value").inner_text())
+
+
+THINGS = {"red": RED, "yellow": YELLOW, "blue": BLUE}
+
+
+def things_in(tab: Tab) -> dict[str, np.ndarray]:
+    """Where things of the room are in the picture, once it is drawn."""
+    photo = tab.sees(lambda seen: all(hue_mask(seen, *rule).sum() > 3000 for rule in THINGS.values()), "the room")
+    return {name: hue_mask(photo, *rule) for name, rule in THINGS.items()}
+
+
+def test_a_person_asks_clicks_saves_and_outlives_the_server(tab: Tab, stock: Server, tmp_path: Path) -> None:
+    """What each control does is tested in tests/nerfstudio_plugin/test_panel.py; here, that a browser shows it."""
+    for button in ("Ask", "Hide", "Undo", "Clear"):  # without scrolling
+        box = tab.button(button).bounding_box()
+        assert box is not None and box["y"] + box["height"] < 1000
+    things = things_in(tab)
+
+    tab.asks("red, glorp", answered=1, key=True)
+    tab.says(r"⚠\s+glorp")
+    overlay = tab.sees(lambda seen: iou(overlaid(seen), things["red"]) > 0.7, "an overlay of red")
+    tab.until(lambda: tab.output() == "overlay", "the answer is shown")
+    some = tab.selected()
+    for label, value, least in (("Threshold", "0.98", 0), ("Minimum reliability", "0.75", 1)):
+        tab.type(label, value)
+        tab.selects(lambda count, least=least: least <= count < some, f"fewer by {label}")
+        tab.press("Undo")
+        tab.selects(lambda count: count == some, "undone")
+
+    tab.until(lambda: tab.images("svg") == 1, "a histogram")
+    tab.says("object 1")
+    tab.press("Go to")
+    near = tab.sees(lambda seen: changed(seen, overlay) > 3, "the camera has moved")
+    tab.press("Hide")
+    tab.says(HIDDEN)
+    tab.sees(lambda seen: overlaid(seen).sum() < 0.8 * overlaid(near).sum(), "hidden")
+    tab.press("Undo")
+    tab.until(lambda: HIDDEN not in tab.text(), "undone")
+    assert tab.save("Export", tmp_path).name == "red_1.ply"
+    tab.press("Why?")
+    tab.until(lambda: tab.images("jpeg") >= 3, "photographs")
+    panel = tab.page.locator("[role=tabpanel]:visible").bounding_box()
+    assert panel is not None and panel["width"] <= 320  # nothing makes it wider
+
+    tab.page.reload(wait_until="domcontentloaded")  # the camera stands where it stood at first
+    tab.show("rgb")
+    yellow = things_in(tab)["yellow"]
+    for end in ("Escape", "Cancel"):
+        tab.arm("More like this")
+        tab.page.keyboard.press("Escape") if end == "Escape" else tab.press("Cancel")
+        tab.until(lambda: ARMED not in tab.text(), f"disarmed by {end}")
+        tab.click(middle(things["red"]))  # does nothing: the next one is the first that counts
+    tab.arm("More like this")
+    tab.click(middle(yellow))
+    clicked = tab.selects(lambda count: count not in (0, some), "clicked")
+    name = tab.typed("Prompts")
+    vertices = PlyData.read(tab.save("Download selection", tmp_path), mmap=False)["vertex"]
+    assert 0.8 * clicked < vertices.count <= clicked
+    tab.press("Save prompts in run")
+    tab.until(lambda: len(load_query(stock.config.parent / "normlift").texts) == 3, "saved")  # type: ignore[union-attr]
+    stock.stop()
+    stock.start()
+    # the page finds the new server, which shows what is stored
+    tab.until(lambda: tab.typed("Prompts") == f"red, yellow, {name}" and tab.answered() == 3, "reconnected")
+    tab.asks(name, answered=1)
+    tab.selects(lambda count: count == clicked, "asked again")
+    tab.sees(lambda seen: iou(overlaid(seen), yellow) > 0.55, "what was clicked is drawn again")

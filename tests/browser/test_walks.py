@@ -85,7 +85,7 @@ def walks(page: OnPage, walk: Walk, folder: Path) -> None:
     page.page.keyboard.press("Escape")
     page.until(lambda: page.page.locator("#why").is_hidden(), "closed")
 
-    changes(page)
+    page.changes_quickly(50)
 
     distance = "page.view.camera.position.distanceTo(page.view.controls.target)"
     far = page.page.evaluate(distance)
@@ -95,19 +95,3 @@ def walks(page: OnPage, walk: Walk, folder: Path) -> None:
     assert page.page.evaluate("page.view.sees(page.panel.state.objects[0].center)")
     vertices = PlyData.read(page.save("save-ply", folder), mmap=False)["vertex"]
     assert 0 < vertices.count <= page.selected()
-
-
-def changes(page: OnPage) -> None:
-    """Makes 22 changes of the colors, faster than the scene is drawn; no frame is missing or unsorted."""
-    revision = page.page.evaluate("page.revision")
-    modes = [f"mode-{name}" for name in ("heat", "prompts", "rgb", "reliability", "pca", "overlay")]
-    names = "hide show invert invert undo redo undo grow shrink isolate show hide show theme"
-    for step in [*modes, *(f"do-{name}" for name in names.split()), "mode-rgb", "mode-overlay"]:
-        page.does(step)
-        page.page.wait_for_timeout(50)
-    page.until(lambda: page.page.evaluate("page.revision") >= revision + 20, "changes")
-    page.calm()
-    frames = page.frames()
-    assert len(frames) >= 10
-    assert [frame for frame in frames if frame["splats"] != frames[0]["splats"] or frame["covered"] < 0.02] == []
-    assert [frame for frame in frames if (frame["unsorted"] or 0) > 0.002] == []

@@ -333,7 +333,7 @@ def test_real_captures_one_of_them_damaged(trained, tmp_path, monkeypatch, capsy
     flags = ("list.txt", "--results", "results", "--", *SMALL, "--output-dir", "lifted", "--queries", "red")
     assert run_entry(monkeypatch, batch.entrypoint, *flags) == 1
     text = said(capsys)
-    assert "1 lifted, 1 failed" in text and "config at gone/config.yml" in text
+    assert "1 lifted, 1 failed" in text and "config gone/config.yml does not exist" in text
     (config,) = Path().glob("lifted/room/normlift/batch_*/config.yml")
     stored = open_run(config).ask_stored()
     assert stored is not None and stored["red"].peak > 0.8

@@ -61,7 +61,7 @@ def test_a_capture_is_checked_and_lifted_as_planned(checked, trained, tmp_path, 
 def test_what_is_wrong_is_told_in_a_row_with_exit_code_1(checked, trained, tmp_path, monkeypatch, capsys) -> None:
     code, found = checked("--load-config", tmp_path / "config.yml")
     assert code == 1 and states(found) == {"options": "error"} and found["plan"] is None
-    assert "no config at" in found["findings"][0]["found"]
+    assert "config.yml does not exist" in found["findings"][0]["found"]
     code, found = checked("--device", "cuda:7")
     assert code == 1 and states(found)["device"] == "error"
     monkeypatch.setattr(planning, "in_frustum", lambda means, camera: means[:, 0] > 1e9)

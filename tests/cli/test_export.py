@@ -1,7 +1,4 @@
 import json
-import shutil
-import subprocess
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -214,54 +211,3 @@ def test_masks_arrays_and_labels_of_a_cloud(scene_ply, lifted, room, tmp_path, m
     assert run_entry(monkeypatch, export.entrypoint, *flags[:2], *again) == 1
     assert "class_id, instance_id, relevancy_0, relevancy_1" in said(capsys)
     assert not (tmp_path / "again").exists()  # refused before anything is written
-
-
-VERSION, NODE = "3.7.0", "22"
-FOLDER = Path(tempfile.gettempdir()) / f"normlift-splat-transform-{VERSION}"
-"""Kept, so that it is downloaded once."""
-
-
-@pytest.fixture(scope="module")
-def converter() -> list[str]:
-    """The words that start @playcanvas/splat-transform from npm. Its version 2.7.1, which older nodes get without a
-    word, hides what version 3 does to signed numbers."""
-    npm = shutil.which("npm")
-    if npm is None:
-        pytest.skip("npm is absent, which brings the converter")
-    package = FOLDER / "node_modules" / "@playcanvas" / "splat-transform" / "package.json"
-    node = FOLDER / "node_modules" / "node" / "bin" / "node"
-    if not (package.is_file() and node.is_file()):
-        FOLDER.mkdir(exist_ok=True)
-        (FOLDER / "package.json").write_text('{"private": true}')
-        install = [npm, "install", "--no-audit", "--no-fund", f"@playcanvas/splat-transform@{VERSION}", f"node@{NODE}"]
-        done = subprocess.run(install, cwd=FOLDER, capture_output=True, text=True, timeout=300, check=False)
-        if done.returncode != 0 or not node.is_file():
-            pytest.skip(f"npm cannot install the converter: {' '.join((done.stderr + done.stdout).split())[-300:]}")
-    assert json.loads(package.read_text())["version"] == VERSION
-    binary = json.loads(package.read_text())["bin"]
-    start = package.parent / (binary if isinstance(binary, str) else binary["splat-transform"])
-    return [str(node), str(start)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_the_converter_keeps_what_we_say(mode, converter, lifted: Path, tmp_path: Path) -> None:
-    run = open_run(lifted)
-    if mode == "antialiased":
-        run.scene.model_config.rasterize_mode = mode  # type: ignore[attr-defined]
-    run.export(tmp_path / "a.ply", answer=run.ask("red", "yellow"))
-    ours = PlyData.read(tmp_path / "a.ply")
-    assert ("SplatRenderMode: mip" in ours.comments) == (mode == "antialiased")
-    words = [*converter, str(tmp_path / "a.ply"), str(tmp_path / "b.ply")]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    theirs = PlyData.read(tmp_path / "b.ply")["vertex"]
-    assert theirs.count == ours["vertex"].count
-    order = [np.lexsort([table[name] for name in "xyz"]) for table in (theirs, ours["vertex"])]
-    for name in {p.name for p in ours["vertex"].properties} - {"nx", "ny", "nz"}:
-        found, wanted = (t[name][o].astype(float) for t, o in zip((theirs, ours["vertex"]), order))
-        assert np.allclose(found, wanted, rtol=0 if name.endswith("_id") else 1e-5, atol=1e-5), name
-    kept = [*converter, str(tmp_path / "a.ply"), "--filter-value", "class_id,eq,1", str(tmp_path / "c.ply")]
-    done = subprocess.run(kept, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert PlyData.read(tmp_path / "c.ply")["vertex"].count == int((ours["vertex"]["class_id"] == 1).sum())

@@ -100,7 +100,7 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
 def test_answers_and_reasons_fit_into_the_terminal_with_all_their_numbers():
     row = {"text": "tomato red", **NUMBERS, "centroid": [-0.18, 0.25, -0.45], "extent": [0.26, 0.27, 0.1]}
     votes = tuple(ViewVote(i, 13_320.0, 0.088, 0.994 - i, 0.21, ()) for i in range(2))
-    why, names = Why(606, 60, 1.0, 1.0, 1.0, 16.6, 0.9, votes), ["images/0012.png", "images/0017.png"]
+    why, names = Why(606, 0.1, 1.0, 1.0, 1.0, 16.6, 0.9, votes), ["images/0012.png", "images/0017.png"]
     for width in (60, 80, 120):
         for table, numbers in (
             (query.answer_table([row], "cosine > 0.5", 0.5, narrow=width < 100), "-0.18 0.25 -0.45 0.26 0.27 0.10"),

@@ -118,7 +118,7 @@ def test_flat_gaussians_are_told_from_others(scene) -> None:
     match = measure_alignment(
         Thick(scene, lambda view: view._replace(image=render_image(scene, view.camera, gaussians=gaussians)))
     )
-    assert "2D Gaussian splatting" in str(match.cause)
+    assert "2D Gaussian Splatting" in str(match.cause)
 
 
 def test_a_render_must_beat_the_mean_color_by_three_decibels() -> None:

@@ -65,7 +65,7 @@ def test_the_project_is_found_where_it_lies(tmp_path: Path) -> None:
     found = tmp_path / "a" / "sparse" / "0"
     assert find_colmap_model(tmp_path / "a") == found == find_colmap_model(found)
     (tmp_path / "b").mkdir()
-    for name, message in (("b", "COLMAP"), ("c", "no folder")):
+    for name, message in (("b", "COLMAP"), ("c", "does not exist")):
         with pytest.raises(FileNotFoundError, match=message):
             find_colmap_model(tmp_path / name)
 

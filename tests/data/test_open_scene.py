@@ -17,7 +17,7 @@ from normlift_ns.data.images import ImageViews
 from normlift_ns.data.open_scene import open_saved_splat
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.data.transforms import gsplat_normalization, read_transforms, write_transforms
-from normlift_ns.evidence_collection import FeatureExport
+from normlift_ns.encoders.langsplat import FeatureExport
 from normlift_ns.rasterization.rasterize import rasterize_evidence
 from tests.captures import SHARED, needs_shared
 from tests.data.scene_files import (

@@ -45,7 +45,7 @@ def test_a_format_of_another_package_is_read_by_its_suffix(options: SplatOptions
         scene = open_splat(path, options)
         assert (scene.step, scene.rasterize_mode) == (7, "antialiased")
         assert torch.equal(scene.splat.means, splat.means)
-        with pytest.raises(FileNotFoundError, match="no PLY file"):  # names of built-in formats are taken
+        with pytest.raises(FileNotFoundError, match="The PLY file "):  # names of built-in formats are taken
             open_splat(tmp_path / "scene.ply", options)
 
 

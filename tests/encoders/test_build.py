@@ -5,7 +5,7 @@ from pathlib import Path
 from normlift_ns.encoders.base import PatchFeatures
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
-from normlift_ns.encoders.package_files import EDGES, IMAGENET, PackageFile
+from normlift_ns.encoders.weights import EDGES, IMAGENET, PackageFile
 from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation import registry
 from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels

@@ -18,8 +18,8 @@ from normlift_ns.encoders import registry as encoders
 from normlift_ns.encoders.base import PatchFeatures
 from normlift_ns.encoders.imagenet import find_classes
 from normlift_ns.encoders.imagenet_network import EfficientNetLite2, ImageNetEncoder, load_network, pool_regions
-from normlift_ns.encoders.package_files import IMAGENET
 from normlift_ns.encoders.registry import make_encoder
+from normlift_ns.encoders.weights import IMAGENET
 from normlift_ns.options import SourceOptions
 from tests.captures import SHARED, capture, needs_shared
 from tests.encoders.tiny import needs_cuda, noise, refused

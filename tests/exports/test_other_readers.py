@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
 
 from normlift_ns import open_run
 from normlift_ns.data.open_splat import _read
@@ -135,3 +136,22 @@ def test_three_and_the_validator_read_our_glb(node: Callable[..., str], lifted: 
     covariances = (turns @ turns.transpose(1, 2)).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     found = torch.tensor(read["splat"]["covariance"]).reshape(-1, 6)
     torch.testing.assert_close(found.double(), covariances, rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_splat_transform_keeps_all_our_properties(mode, node: Callable[..., str], lifted: Path, tmp_path: Path) -> None:
+    run = open_run(lifted)
+    if mode == "antialiased":
+        run.scene.model_config.rasterize_mode = mode  # type: ignore[attr-defined]
+    run.export(tmp_path / "a.ply", answer=run.ask("red", "yellow"))
+    ours = PlyData.read(tmp_path / "a.ply")
+    assert ("SplatRenderMode: mip" in ours.comments) == (mode == "antialiased")
+    node("-w", tmp_path / "a.ply", tmp_path / "b.ply")
+    theirs = PlyData.read(tmp_path / "b.ply")["vertex"]
+    assert theirs.count == ours["vertex"].count
+    order = [np.lexsort([table[name] for name in "xyz"]) for table in (theirs, ours["vertex"])]
+    for name in {p.name for p in ours["vertex"].properties} - {"nx", "ny", "nz"}:
+        found, wanted = (t[name][o].astype(float) for t, o in zip((theirs, ours["vertex"]), order))
+        assert np.allclose(found, wanted, rtol=0 if name.endswith("_id") else 1e-5, atol=1e-5), name
+    node("-w", tmp_path / "a.ply", "--filter-value", "class_id,eq,1", tmp_path / "c.ply")
+    assert PlyData.read(tmp_path / "c.ply")["vertex"].count == int((ours["vertex"]["class_id"] == 1).sum())

@@ -150,7 +150,7 @@ def test_nothing_is_overwritten_unasked(tmp_path):
     lifted, means, source = example()
     SemanticField.build(lifted, means, source, storage="evidence").save(tmp_path)
     other = SemanticField.build(lifted, means, source, storage="float16")
-    with pytest.raises(FileExistsError, match="already holds a semantic field"):
+    with pytest.raises(FileExistsError, match="already contains a semantic field"):
         other.save(tmp_path)
     other.save(tmp_path, overwrite=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["field.safetensors", "manifest.json"]

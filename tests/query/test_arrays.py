@@ -17,9 +17,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from prompt_toolkit.application import create_app_session
-from prompt_toolkit.input import create_pipe_input
-from prompt_toolkit.output import DummyOutput
 
 from normlift_ns import InputError, SemanticField, open_run
 from normlift_ns.cli import query
@@ -80,7 +77,7 @@ def test_every_rule_is_in_the_table_and_vectors_of_another_encoder_are_refused(t
     assert set(RELEVANCY_RULES) == set(get_args(RelevancyRule))
     lifted, means, source = example()
     SemanticField.build(lifted, means, source).save(tmp_path)
-    with pytest.raises(InputError, match=rf"must be \[Q, {D}\].*got \(1, 3\)"):
+    with pytest.raises(InputError, match=rf"must have shape \[Q, {D}\].*got \(1, 3\)"):
         arrays.ArrayField(*read_field(tmp_path)).query(np.ones((1, 3), np.float32))
 
 
@@ -166,6 +163,10 @@ def test_lines_are_answered_as_they_come_also_those_of_windows(lifted, monkeypat
 
 
 def test_a_person_asks_one_text_after_the_other(lifted, tmp_path, monkeypatch, capsys):
+    from prompt_toolkit.application import create_app_session  # noqa: PLC0415 (slow)
+    from prompt_toolkit.input import create_pipe_input  # noqa: PLC0415
+    from prompt_toolkit.output import DummyOutput  # noqa: PLC0415
+
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     run = arrays.open_quick(lifted)
     assert run is not None

@@ -15,7 +15,7 @@ from scipy.ndimage import label
 from normlift_ns.cli.preflight import check_source_options
 from normlift_ns.encoders.build import make_source
 from normlift_ns.encoders.cache import CachedRegions
-from normlift_ns.encoders.package_files import EDGES
+from normlift_ns.encoders.weights import EDGES
 from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.edges import (
     ALGORITHM,

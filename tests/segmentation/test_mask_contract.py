@@ -12,7 +12,7 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from normlift_ns.encoders.cache import CachedRegions
-from normlift_ns.segmentation import mask_filtering, sam3
+from normlift_ns.segmentation import regions, sam3
 from normlift_ns.segmentation.mask_filtering import Suppression
 from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels
 from normlift_ns.segmentation.sam import SAM_LEVELS, SamMasks, load_sam_network
@@ -134,7 +134,7 @@ def test_memory_on_a_cpu_is_that_of_a_batch_of_masks(folders, kind, monkeypatch)
     """However many masks there are, few are enlarged at a time."""
     image = photograph(150, 220)
     monkeypatch.setattr(sam3, "_TOGETHER", 2)
-    monkeypatch.setitem(mask_filtering._CHUNK, "cpu", 2**17)  # of the suppression
+    monkeypatch.setitem(regions._MASK_CHUNK, "cpu", 2**17)  # of the suppression
     source = make(kind, folders[kind])
     if kind != "sam3":
         source = replace(source, rules=replace(EVERY, points_per_side=5))

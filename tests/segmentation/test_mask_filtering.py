@@ -10,14 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
-from normlift_ns.segmentation import mask_filtering
-from normlift_ns.segmentation.mask_filtering import (
-    Suppression,
-    mask_nms,
-    masks_to_boxes,
-    remove_small_regions,
-    stack_masks,
-)
+from normlift_ns.segmentation import mask_filtering, regions
+from normlift_ns.segmentation.mask_filtering import Suppression, mask_nms, masks_to_boxes, remove_small_regions
+from normlift_ns.segmentation.regions import stack_masks
 from tests.encoders.tiny import DEVICES, needs_cuda
 from tests.examples import examples
 
@@ -26,7 +21,7 @@ from tests.examples import examples
 def small_chunks() -> Iterator[None]:
     """So that these masks are read in several parts."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(mask_filtering._CHUNK, "cpu", 200)
+        patch.setitem(regions._MASK_CHUNK, "cpu", 200)
         yield
 
 

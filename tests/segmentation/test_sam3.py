@@ -94,7 +94,7 @@ def test_what_is_refused(written, tmp_path, monkeypatch):
     copied(written, tmp_path)
     for name in ("tokenizer.json", "vocab.json"):
         (tmp_path / name).unlink(missing_ok=True)
-    refused(lambda: Sam3Network.load(str(tmp_path), "cpu"), str(tmp_path), "no tokenizer.json")
+    refused(lambda: Sam3Network.load(str(tmp_path), "cpu"), str(tmp_path), "neither tokenizer.json")
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam2"}))
     refused(lambda: Sam3Masks(("mug",), str(tmp_path)), "'sam2'", "--regions sam)", "'sam3'")
     monkeypatch.setattr("normlift_ns.encoders.weights.version", lambda package: "2.5.0")

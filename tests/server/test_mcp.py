@@ -3,6 +3,7 @@
 import asyncio
 import json
 import sys
+from importlib.util import find_spec
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from normlift_ns.server.app import ServerOptions, WarmServer
 from normlift_ns.server.runs import RunStore
 from tests.server.pages import make_served, make_server
 
-mcp = pytest.importorskip("mcp")
+pytestmark = pytest.mark.skipif(find_spec("mcp") is None, reason="mcp is not installed")
 
 
 def texts(result: Any) -> Any:
@@ -21,7 +22,9 @@ def texts(result: Any) -> Any:
 
 async def walk(target: Any) -> list[str]:
     """Lists, finds, counts, looks, measures and exports; returns the names of exported files."""
-    async with mcp.Client(target) as agent:
+    from mcp import Client  # noqa: PLC0415 (slow)
+
+    async with Client(target) as agent:
         tools = {tool.name: tool for tool in (await agent.list_tools()).tools}
         assert all(len(tool.description or "") > 60 for tool in tools.values())
         (run,) = texts(await agent.call_tool("list_runs", {}))
@@ -99,6 +102,8 @@ def test_elsewhere_mcp_needs_the_token(tmp_path):
 
 @pytest.mark.slow
 def test_an_agent_starts_the_command(lifted, tmp_path):
+    from mcp import StdioServerParameters  # noqa: PLC0415 (slow)
+
     command = ["-m", "normlift_ns.cli.serve", str(lifted), "--mcp", "--export-dir", str(tmp_path / "out")]
-    first, second = asyncio.run(walk(mcp.StdioServerParameters(command=sys.executable, args=command)))
+    first, second = asyncio.run(walk(StdioServerParameters(command=sys.executable, args=command)))
     assert {first, second} < {path.name for path in (tmp_path / "out").iterdir()}

@@ -6,16 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns.errors import InputError
+from normlift_ns.query.question import join_prompts, split_prompts
 from normlift_ns.session.prompts import (
     MAX_PROMPTS,
     Prompt,
     build_query,
     click_name,
     encode_prompts,
-    join_prompts,
     merge_queries,
     prompts_of_query,
-    split_prompts,
 )
 from tests.session.worlds import read, world
 

@@ -1,8 +1,8 @@
 /**
  * Connection of this page to its session on the server.
  *
- * It reconnects automatically and restores the last query. It dispatches `status` events with `online` and `reason`,
- * and one event for each message, with the message's type as its name.
+ * The connection is reopened automatically, and the last query is restored. The class dispatches `status` events with
+ * `online` and `reason`, and one event for each message. The name of that event is the type of the message.
  */
 
 /** @typedef {{type: string, seq?: number, [name: string]: any}} Message */
@@ -17,7 +17,7 @@ export function parseFrame(frame) {
 }
 
 export class Connection extends EventTarget {
-  /** @param {string} run Id of the run. @param {() => object} greeting Value of the first action. */
+  /** @param {string} run Id of the run. @param {() => object} greeting Returns the value of the first action. */
   constructor(run, greeting) {
     super();
     this.run = run;

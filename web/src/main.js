@@ -245,7 +245,11 @@ class Page {
       { keys: "S", text: "Save a screenshot", run: press("do-screenshot") },
       { keys: "D", text: "Switch between dark and light", run: press("do-theme") },
       { keys: "Home", text: "Go back to the first view", run: press("do-home") },
-      { keys: "?", text: "Toggle this list", run: () => ($("help").open ? $("help").close() : $("help").showModal()) },
+      {
+        keys: "?",
+        text: "Show or hide this list",
+        run: () => ($("help").open ? $("help").close() : $("help").showModal()),
+      },
     ];
   }
 
@@ -307,12 +311,13 @@ class Page {
       });
   }
 
-  /** Start the renderer, while the server renders the first image. */
+  /** Start the renderer while the server renders the first image. */
   async start() {
     this.started = true;
     const renderer = createRenderer($("canvas"));
     if (!renderer) {
-      $("loading").querySelector("p").textContent = "This browser has no WebGL 2, so the server renders the scene.";
+      $("loading").querySelector("p").textContent =
+        "This browser does not support WebGL 2, so the server renders the scene.";
       $("blend").hidden = $("do-compare").hidden = this.stills.fine = true;
       return this.stills.request(false);
     }
@@ -338,7 +343,7 @@ class Page {
     if (this.waiting) this.scene.paint(this.waiting.payload, this.waiting.palette);
   }
 
-  /** Wait a moment for an image from the server, which a software renderer would slow down. */
+  /** Wait a moment for an image from the server, because a software renderer would delay this image. */
   firstStill() {
     return new Promise((resolve) => {
       $("still").addEventListener("load", resolve, { once: true });
@@ -458,7 +463,8 @@ class Page {
     this.connection.remember({ search: location.search });
     const anchor = this.anchors.get(seq);
     const done = () => toast("Link copied", { kind: "done", anchor });
-    const failed = () => toast("The link is now the address of this page. Copy it there.", { kind: "done", anchor });
+    const failed = () =>
+      toast("The link is now the address of this page. Copy it from the address bar.", { kind: "done", anchor });
     navigator.clipboard ? navigator.clipboard.writeText(location.href).then(done, failed) : failed();
   }
 

@@ -1,4 +1,4 @@
-/** Outline of the selection, which makes it visible in every color. */
+/** Outline that makes the selection visible in every color. */
 import * as THREE from "three";
 import { fullScreenPass } from "./passes.js";
 

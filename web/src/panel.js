@@ -10,8 +10,6 @@ const RULES = [
   ["margin", "Margin over negatives"],
   ["cosine", "Cosine"],
 ];
-/** @param {number} value */
-const evidence = (value) => (value >= 0.7 ? "strong" : value >= 0.4 ? "moderate" : "weak");
 
 /** @typedef {(action: string, value?: any, anchor?: Element | null) => number} Act */
 
@@ -205,7 +203,7 @@ export class Panel {
             value: 0,
             oninput: () => this.slid("reliability"),
             onchange: () => this.rested(),
-            "data-tip": "Deselect Gaussians that few images show clearly.",
+            "data-tip": "Deselect Gaussians whose reliability is below this number.",
           }),
         ),
       ),
@@ -214,8 +212,10 @@ export class Panel {
         h("p.soft.small", { id: "no-layers" }, "Save a selection as a layer to restore it later."),
         h("ul.list", { id: "layers" }),
       ]),
-      fold("history", "History", "All steps. Press one to go back to it.", [h("ol.list", { id: "history" })]),
-      fold("cameras", "Training cameras", "Look from where an image was taken.", [h("div", { id: "cameras" })]),
+      fold("history", "History", "All steps. Click a step to go to it.", [h("ol.list", { id: "history" })]),
+      fold("cameras", "Training cameras", "Move the camera to where an image was taken.", [
+        h("div", { id: "cameras" }),
+      ]),
       fold("advanced", "Advanced", "Negative prompts, rule, colormap, floaters and saved prompts.", this.advanced()),
     );
     $("facts").textContent =
@@ -288,7 +288,7 @@ export class Panel {
         button(
           "Remove weak evidence",
           null,
-          "Remove Gaussians that few images show clearly from the selection.",
+          "Remove Gaussians with weak evidence from the selection.",
           null,
           (anchor) => act("remove_weak", null, anchor),
           { id: "do-weak" },
@@ -366,11 +366,10 @@ export class Panel {
   show(state) {
     const before = this.state;
     if (!state.details && before) {
-      const same = before.selected === state.selected && before.by_hand === state.by_hand;
       state = {
         ...state,
         histogram: state.prompts.length ? before.histogram : null,
-        objects: same ? before.objects : before.objects,
+        objects: before.objects,
         suggested: before.suggested,
       };
     }
@@ -459,7 +458,7 @@ export class Panel {
       : "";
     const colors = new Map(state.prompts.map((/** @type {any} */ one) => [one.text, one.color]));
     const rows = state.objects.map((/** @type {any} */ one) => {
-      const facts = `${grouped(one.count)} · ${evidence(one.reliability)} evidence`;
+      const facts = `${grouped(one.count)} · ${one.evidence.split(" (")[0]}`;
       const small = (
         /** @type {string} */ label,
         /** @type {any} */ name,
@@ -478,7 +477,7 @@ export class Panel {
           "button.main",
           {
             type: "button",
-            "data-tip": "Select this object. Shift adds, Ctrl removes.",
+            "data-tip": "Select this object. Hold Shift to add it, or Ctrl to remove it.",
             "data-key": `object-${one.name}`,
             onclick: (/** @type {MouseEvent} */ event) =>
               act(

@@ -57,7 +57,7 @@ export class Search {
   showExamples(shown) {
     const { examples, saved_prompts: saved } = this.run;
     const pill = (/** @type {string} */ text) =>
-      h("button.pill", { type: "button", "data-tip": `Ask ${text}.`, onclick: () => this.ask(text) }, text);
+      h("button.pill", { type: "button", "data-tip": `Search for ${text}.`, onclick: () => this.ask(text) }, text);
     const pills = [
       ...(saved.length > 0 ? [h("span.soft.small", {}, "Saved:"), pill(saved.join(", "))] : []),
       ...(examples.length > 0 ? [h("span.soft.small", {}, "Try:"), ...examples.slice(0, 4).map(pill)] : []),

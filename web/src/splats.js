@@ -1,5 +1,5 @@
 /**
- * Extension of Spark's renderer with one color byte per Gaussian, and with batches of Gaussians as instances.
+ * Extension of Spark's renderer that adds one color byte per Gaussian, and batches of Gaussians as instances.
  *
  * The shader looks up colors while it draws a frame. Geometry, spherical harmonics and sort order do not change, so a
  * new answer needs no sorting, and the next frame shows it. Hidden Gaussians keep their position in the sort order.

@@ -8,9 +8,9 @@ const REST = 350;
 export class Stills {
   /**
    * @param {import("./view.js").View3D} view
-   * @param {(value: any) => number} send Request an image.
-   * @param {() => void} place Send the camera to the server.
-   * @param {() => void} shown Called for each image that is shown.
+   * @param {(value: any) => number} send Function that requests an image.
+   * @param {() => void} place Function that sends the camera to the server.
+   * @param {() => void} shown Function that is called for each image that is shown.
    */
   constructor(view, send, place, shown) {
     this.view = view;

@@ -7,21 +7,21 @@ import { icon } from "./icons.js";
 
 /** @type {[Tool, any, string, string, string][]} Name, icon, label, key, hint. */
 export const TOOLS = [
-  ["select", "select", "Select", "V", "Click an object to select it. Shift adds, Ctrl or Alt removes."],
+  ["select", "select", "Select", "V", "Click an object to select it. Shift adds; Ctrl or Alt removes."],
   [
     "rectangle",
     "rectangle",
     "Rectangle",
     "R",
-    "Drag a rectangle. Shift adds, Ctrl or Alt removes. Right drag moves the view.",
+    "Drag a rectangle. Shift adds; Ctrl or Alt removes. Drag with the right button to move the view.",
   ],
-  ["lasso", "lasso", "Lasso", "L", "Draw around Gaussians to select them. Shift adds, Ctrl or Alt removes."],
+  ["lasso", "lasso", "Lasso", "L", "Draw around Gaussians to select them. Shift adds; Ctrl or Alt removes."],
   [
     "brush",
     "brush",
     "Brush",
     "B",
-    "Paint over Gaussians to select them. The wheel changes the size. Shift adds, Ctrl or Alt removes.",
+    "Paint over Gaussians to select them. The wheel changes the size. Shift adds; Ctrl or Alt removes.",
   ],
   ["like", "alike", "More like this", "K", "Click an object to find all similar Gaussians."],
   ["measure", "measure", "Measure", "M", "Click two points to measure the distance between them."],
@@ -45,7 +45,7 @@ const modeOf = (event) =>
 export class Tools extends EventTarget {
   /**
    * @param {import("./view.js").View3D} view
-   * @param {(action: string, value?: any) => number} act Sends an action.
+   * @param {(action: string, value?: any) => number} act Function that sends an action.
    */
   constructor(view, act) {
     super();

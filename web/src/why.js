@@ -1,4 +1,4 @@
-/** Images that explain a selection, next to the scene. */
+/** Panel next to the scene with images that explain a selection. */
 import { $, h } from "./dom.js";
 import { button } from "./panel.js";
 import { closesOutside } from "./shortcuts.js";

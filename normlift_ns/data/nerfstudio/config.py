@@ -34,7 +34,7 @@ from normlift_ns.options import LiftOptions, RefineConfig, short_repr
 
 OBJECT_TAG = "tag:yaml.org,2002:python/object"
 _MAX_BYTES = 2**18
-"""Maximum size of a config.yml in bytes. Those of nerfstudio have about 6,000."""
+"""Maximum size of a config.yml in bytes. Configs of nerfstudio have about 6,000 bytes."""
 _EXPECTED = "With --load-config, give the config.yml that ns-train splatfacto wrote."
 
 
@@ -46,10 +46,10 @@ def check_config_exists(path: Path, wrote: str = "ns-train") -> None:
         wrote: Command that writes such files, for the error message.
     """
     if not path.is_file():
-        hint = f", but at {path / 'config.yml'}; give that path" if (path / "config.yml").is_file() else ""
+        hint = f", but {path / 'config.yml'} does; give that path" if (path / "config.yml").is_file() else ""
         method = "splatfacto" if wrote == "ns-train" else "normlift"
         raise FileNotFoundError(
-            f"There is no config at {path}{hint}. Expected the config.yml that {wrote} wrote, for example "
+            f"The config {path} does not exist{hint}. Expected the config.yml that {wrote} wrote, for example "
             f"--load-config outputs/fox/{method}/2024-05-01_120000/config.yml."
         )
 
@@ -128,7 +128,7 @@ def read_config_paths(path: Path) -> ConfigPaths:
     """Read names and paths from the YAML of a config.yml, without constructing the config.
 
     Raises:
-        FileNotFoundError, OSError, ValueError: The errors of `compose_config`.
+        FileNotFoundError, OSError, ValueError: As in `compose_config`.
     """
     root = compose_config(path)
     names = [config_string(root, key) for key in ("experiment_name", "method_name", "timestamp")]
@@ -172,8 +172,8 @@ class RunLocation:
 def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunLocation:
     """Locate the files of a run from the path of its config.yml, independent of the current directory.
 
-    Paths in a config.yml are relative to the working directory of the training, which it does not contain. The function
-    infers this directory, because config.yml is in output_dir/experiment/method/timestamp.
+    Paths in a config.yml are relative to the working directory of the training, which the file does not contain. The
+    function infers this directory from the path output_dir/experiment/method/timestamp/config.yml.
 
     Args:
         config: Contents of config.yml.
@@ -188,8 +188,8 @@ def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunL
     if data is not None:
         if not data.exists():
             raise FileNotFoundError(
-                f"There is no dataset at {_absolute(data)}, given with --data. Give the folder or the transforms.json "
-                "that the run was trained with."
+                f"The dataset {_absolute(data)}, given with --data, does not exist. Give the folder or the "
+                "transforms.json that the run was trained with."
             )
         return RunLocation(run_dir, output_dir, root, _absolute(data), data_moved=True)
     stored = dataset_in_config(config)
@@ -215,7 +215,7 @@ def _folders(run_dir: Path, names: Sequence[str | None], output_dir: Path) -> tu
     inferred = _strip_tail(run_dir, Path(*filter(None, names))) if all(names) else None
     if inferred is not None:
         return inferred, _strip_tail(inferred, Path(os.path.normpath(output_dir)))
-    # for a moved run, a folder inside the current directory, also if the config has a folder outside of it
+    # a moved run gets a folder in the current directory, even if the folder in the config is outside of it
     is_elsewhere = output_dir.is_absolute() or ".." in output_dir.parts
     return _absolute(Path("outputs") if is_elsewhere else output_dir), None
 
@@ -254,7 +254,7 @@ CONFIG_TARGETS: dict[str, str | None] = {
     else CLASS_TARGETS.get(cls)
     for name, cls in CONFIG_CLASSES.items()
 }
-"""Names of the classes that configuration classes instantiate, by the name of the configuration class."""
+"""Name of the class that each configuration class instantiates, keyed by the name of the configuration class."""
 _TARGETS = {target for target in CONFIG_TARGETS.values() if target is not None}
 _TARGET = "_target"
 """Field of a config.yml with the class or function that a configuration class instantiates.
@@ -372,7 +372,7 @@ def _represent(dumper: _ConfigDumper, config: Any) -> yaml.Node:
 
 
 _NAMES = {name: _Name(name) for name in CLASS_TARGETS.values()}
-"""One object per name, so that a dump repeats it by reference, like a class."""
+"""One object per name, so that a dump refers to repeated names, as to repeated classes."""
 for _cls in CONFIG_CLASS_NAMES:
     _ConfigDumper.add_representer(_cls, _represent)
 _ConfigDumper.add_representer(_Name, lambda dumper, name: dumper.represent_scalar(_NAME_TAG + name.name, ""))
@@ -401,7 +401,8 @@ _RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "pipeline.datamanager.dataparser.train_split_fraction": (lambda x: 0 < x <= 1, "above 0 and at most 1"),
     "pipeline.datamanager.dataparser.eval_interval": (lambda x: x >= 1, "at least 1"),
 }
-"""Checks and descriptions of the ranges of numbers that affect a lift. Some data parsers lack some numbers."""
+"""Checks and descriptions of the ranges of numbers that affect a lift. Some data parsers do not have all of these
+numbers."""
 _MAX_DEPTH, _MAX_INT = 12, 2**53
 _REMEDY = "Restore the config.yml that ns-train wrote."
 _TRAINING_ONLY = re.compile(
@@ -433,7 +434,7 @@ def export_advice(path: Path) -> str:
 def check_config_values(config: Any, path: Path, say: Callable[[str], None] = lambda text: None) -> None:
     """Raise if a config contains values that stock splatfacto does not accept.
 
-    The function replaces unknown choices of newer versions by the default if they do not affect a lift.
+    The function replaces unknown choices of newer versions with the default if they do not affect a lift.
 
     Args:
         config: Config to check.
@@ -544,7 +545,7 @@ _SCALARS: dict[Any, tuple[Callable[[Any], bool], str]] = {
     Path: (lambda x: isinstance(x, Path) and "\0" not in str(x), "a path"),
     type(None): (lambda x: x is None, "null"),
 }
-"""Check of values and description of valid values, by type hint."""
+"""Check of values, and description of valid values, for each type hint."""
 
 
 def _optimizer_errors(value: Any, name: str) -> Iterator[tuple[str, Any, str]]:
@@ -589,7 +590,7 @@ def _range_errors(config: TrainerConfig) -> Iterator[tuple[str, Any, str]]:
 
 
 def check_lift_options(options: LiftOptions, name: str) -> None:
-    """Check the ranges of lift options. Reading them from a config.yml does not check them.
+    """Check the ranges of lift options, which are not checked when they are read from a config.yml.
 
     Args:
         options: Options to check.
@@ -669,7 +670,7 @@ def set_dataset(config: Any, data: Path) -> None:
 
 
 def skip_seed_points(config: Any) -> None:
-    """Change a config so that the data parser does not read the initial point cloud, which only trainings need."""
+    """Change a config so that the data parser does not read the initial point cloud, which only training needs."""
     dataparser = config.pipeline.datamanager.dataparser
     for name, value in (("load_3D_points", False), ("ply_path", None)):
         if hasattr(dataparser, name):

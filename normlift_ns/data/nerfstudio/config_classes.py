@@ -27,7 +27,7 @@ CLASS_TARGETS: dict[type, str] = {}
 
 @dataclass_transform(field_specifiers=(field,))
 def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class]:
-    """Return a decorator that makes a class a dataclass, and registers it as the mirror of the class of that name.
+    """Return a decorator that turns a class into a dataclass, and registers it as the mirror of the class of that name.
 
     Args:
         module: Module of the mirrored class.
@@ -191,7 +191,7 @@ CONFIG_CLASS_NAMES[EventName] = "nerfstudio.utils.writer.EventName"
 
 @_mirror(_BASE)
 class MachineConfig:
-    """Random seed and devices of a training."""
+    """Random seed and devices of a training run."""
 
     seed: int = 42
     num_devices: int = 1
@@ -324,7 +324,7 @@ class NormLiftPipelineConfig(VanillaPipelineConfig):
 
 @_mirror("nerfstudio.engine.trainer", "Trainer")
 class TrainerConfig:
-    """Options of a training, the root object of a config.yml."""
+    """Options of a training run, the root object of a config.yml."""
 
     output_dir: Path = Path("outputs")
     method_name: str | None = None

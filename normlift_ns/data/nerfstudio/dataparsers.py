@@ -280,8 +280,8 @@ def split_files(
     validation list, which ns-train evaluates on.
 
     Raises:
-        ValueError: There are lists, but no list of training images, or a listed file is missing. With eval_mode
-            filename, a file name contains neither train nor eval.
+        ValueError: There are lists, but no list of training images, or a listed file is missing. Also if eval_mode is
+            filename, and a file name contains neither train nor eval.
     """
     if any(names is not None for names in lists.values()):
         held_out = [lists[split] for split in ("test", "val") if lists[split] is not None]
@@ -412,7 +412,9 @@ def _check_transforms(meta: TransformsEntries, path: Path, parser: config_classe
     _check_files([path.parent / frame.file_path for frame in meta.frames], path)
     count, masked = len(meta.frames), sum(frame.mask_path is not None for frame in meta.frames)
     if masked not in (0, count):
-        raise InputError(f"{path} lists masks for {masked} of {count} images, expected a mask for each, or no masks")
+        raise InputError(
+            f"{path} lists masks for {masked} of {count} images, expected masks for all images or for none"
+        )
 
 
 def _transforms(parser: config_classes.NerfstudioDataParserConfig) -> ParsedDataset:
@@ -545,8 +547,8 @@ def _parse_colmap(parser: config_classes.ColmapDataParserConfig) -> ParsedDatase
     missing = sorted({file.parent for file in files if factor > 1 and not file.parent.is_dir()})
     if missing:  # nerfstudio offers to create it
         raise FileNotFoundError(
-            f"There is no folder {missing[0]}, expected the images at 1/{factor} of their size, which the run was "
-            f"trained with. Resize the images in {images_dir}; normlift_ns does not write into datasets."
+            f"The folder {missing[0]} does not exist. Expected the images at 1/{factor} of their size, which the run "
+            f"was trained with. Resize the images in {images_dir}; normlift_ns does not write into datasets."
         )
     masks = None
     if parser.masks_path is not None:
@@ -580,7 +582,7 @@ def _colmap_rows(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapIma
     if len(kinds) > 1:
         raise InputError("the images have perspective and fisheye cameras, expected only one of these types")
     if any(rows[image.camera_id][9] != 0 for image in images):
-        raise InputError("the distortion k4 of a camera is not zero, expected zero")
+        raise InputError("the distortion parameter k4 of a camera must be zero")
     return kinds.pop(), [rows[image.camera_id] for image in images]
 
 
@@ -617,7 +619,7 @@ def _read_lists(parser: config_classes.ColmapDataParserConfig) -> dict[str, Any]
 
 
 def _downscaled(files: list[Path], folder: Path, factor: int) -> list[Path]:
-    """Return the paths of the copies of files that are downscaled by a factor; unchanged for factor 1."""
+    """Return the paths of copies of the files, downscaled by a factor. For factor 1, return the paths of the files."""
     smaller = folder.parent / f"{folder.name}_{factor}"
     return files if factor == 1 else [smaller / file.relative_to(folder) for file in files]
 

@@ -230,7 +230,7 @@ def load_nerfstudio_scene(
     count, expected = checkpoint.splat.features_rest.shape[1], (model.sh_degree + 1) ** 2 - 1
     if count != expected:
         raise InputError(
-            f"{checkpoint.path} has {count} spherical harmonics without the constant one, but {load_config} has "
+            f"{checkpoint.path} has {count} spherical harmonics above degree 0, but {load_config} has "
             f"sh_degree {model.sh_degree}, which needs {expected}. Copy the checkpoint and the config of the same "
             "training run again."
         )
@@ -238,7 +238,7 @@ def load_nerfstudio_scene(
     if not bool(gaussians.drawable.any()):
         raise InputError(
             f"{checkpoint.path}: all {len(gaussians):,} Gaussians have NaN or infinite parameters, or zero "
-            "quaternions, so they cannot be drawn. Give another checkpoint with --load-step."
+            "quaternions, so they cannot be rendered. Give another checkpoint with --load-step."
         )
     dataset = parse_dataset(datamanager, data_given=data is not None)
     advice = "" if data is not None else ", or give the path of the dataset with --data"

@@ -1,0 +1,95 @@
+"""The best that a rule for the threshold could reach on a capture if its number were chosen there, in hindsight.
+
+    python -m research.hindsight castle=RUN/config.yml          results/hindsight.json
+
+Prototypes and pixels are those of `research.cut`. Families of rules, each with one number for all prototypes: a fixed
+cosine; a share of the top cosine; a share of the way from the median to the top; a relevancy of rule contrast;
+the same number of Gaussians for all, as a share; the most stable threshold, with another range. The number is the one
+with the largest mean over prototypes of IoU divided by the best IoU of the cosine.
+
+Keys: <capture>.<family>.mean, .worst, .number and .below (prototypes under 40 %); <capture>.default likewise;
+<capture>.<label>.best, the best IoU, .share, of the pixels, and .<family>, the share of the best IoU reached.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from normlift_ns.core.relevancy import TOP_QUANTILE
+from normlift_ns.query.engine import suggest_threshold
+from research.cut import Asked, ask, best_cut
+from research.report import Report
+
+SHARES = np.linspace(0, 1, 101)
+
+
+class Prototype:
+    """A prototype with IoU at any threshold."""
+
+    def __init__(self, asked: Asked) -> None:
+        order = np.argsort(-asked.values)
+        self.descending, hits = asked.values[order], asked.truth[order].cumsum()
+        self.iou = np.concatenate([[0.0], hits / (asked.truth.sum() + np.arange(1, len(order) + 1) - hits)])
+        self.best, self.share = best_cut(asked.values, asked.truth), float(asked.truth.mean())
+        self.cosines = np.sort(asked.answer.relevancy[asked.answer.valid, 0].numpy())
+        self.threshold = float(asked.answer.question.threshold)
+        self.median, self.top = np.quantile(self.cosines, (0.5, TOP_QUANTILE))
+
+    def reached(self, threshold: float) -> float:
+        """IoU at a threshold as a share of the best."""
+        return float(self.iou[np.searchsorted(-self.descending, -threshold, side="left")] / self.best)
+
+
+Family = tuple[Callable[[Prototype, Any], Any], Iterable[Any]]
+STABLE = [(a, b) for a in (0.2, 0.3, 0.4, 0.5) for b in (0.5, 0.6, 0.7, 0.8) if a < b]
+FAMILIES: dict[str, Family] = {
+    "cosine": (lambda p, x: x, SHARES),
+    "share of the top": (lambda p, x: x * p.top, SHARES),
+    "from the median": (lambda p, x: p.median + x * (p.top - p.median), SHARES),
+    "same number": (lambda p, x: float(np.quantile(p.cosines, 1 - x)), np.geomspace(1e-4, 0.5, 60)),
+    "stable": (lambda p, x: suggest_threshold(p.cosines[:, None], np.ones(len(p.cosines), bool), x) or 0.0, STABLE),
+}
+
+
+def measure(report: Report, capture: str, config: Path) -> None:
+    """Add the figures of one lifted capture."""
+    asked = {key: Prototype(x) for key, x in ask(capture, config).items() if not key.startswith("word ")}
+    contrast = {key: Prototype(x) for key, x in ask(capture, config, "contrast").items() if key in asked}
+    shares = {"default": {key: p.reached(p.threshold) for key, p in asked.items()}}
+    numbers: dict[str, Any] = {}
+    for family, (rule, choices) in FAMILIES.items():
+        tried = [(x, {key: p.reached(rule(p, x)) for key, p in asked.items()}) for x in choices]
+        numbers[family], shares[family] = max(tried, key=lambda found: np.mean(list(found[1].values())))
+    tried = [
+        (x, {key: contrast[key].reached(x) * contrast[key].best / p.best for key, p in asked.items()}) for x in SHARES
+    ]
+    numbers["contrast"], shares["contrast"] = max(tried, key=lambda found: np.mean(list(found[1].values())))
+    for name, found in shares.items():
+        values = np.array(list(found.values()))
+        print(capture, name, numbers.get(name), {key: round(value, 2) for key, value in found.items()})
+        report.add(f"{capture}.{name}.mean", values.mean(), "of the best IoU")
+        report.add(f"{capture}.{name}.worst", values.min(), "of the best IoU")
+        report.add(f"{capture}.{name}.below", (values < 0.4).sum(), f"of {len(values)} prototypes")
+    for key, p in asked.items():
+        report.add(f"{capture}.{key}.best", p.best, "IoU")
+        report.add(f"{capture}.{key}.share", p.share, "of the pixels")
+
+
+def main() -> None:
+    """Write the results."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", help="CAPTURE=config.yml of a lifted run")
+    report = Report("hindsight")
+    for text in parser.parse_args().runs:
+        capture, config = text.split("=", 1)
+        measure(report, capture, Path(config))
+    report.write()
+
+
+if __name__ == "__main__":
+    main()
