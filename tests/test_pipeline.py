@@ -28,7 +28,6 @@ from normlift_ns.evaluation.lerf import run_lerf
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, mask_truth
 from normlift_ns.evaluation.studies import voting_scalars
-from normlift_ns.evidence_collection import FeatureExport
 from normlift_ns.options import VOTE_DEFAULTS
 from normlift_ns.pipeline import lift_scene, min_agreement
 from normlift_ns.progress import lift_cost
