@@ -36,6 +36,8 @@ _NEEDLE = tl.constexpr(1e-6)
 Below this ratio, the determinant is too inaccurate.
 """
 _FAR = tl.constexpr(1e30)
+_SIZES = ("width", "height", "tiles_across", "tiles_down", "cells_across", "cells_down")
+"""Arguments of kernels that are compiled once for images of all sizes."""
 
 
 class CellGrid(NamedTuple):
@@ -77,7 +79,7 @@ class CellLists(NamedTuple):
     """Rows of the splats in `ProjectedSplats`."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["entries", "views", *_SIZES])
 def _pairs(
     splats, order, keys, starts, ends, out_count, out_cell, out_member, entries, views, width, height, min_alpha,
     tiles_across, tiles_down, cells_across, cells_down,
@@ -325,7 +327,7 @@ def _number_labels(
     tl.store(counts + cell, count)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["first_cell", "first_slot", "columns"])
 def _sum_regions(
     splats, members, offsets, local, table, counts, base, out_key, out_weight, out_used,
     first_cell, first_slot, columns, cells_across, cells, max_alpha, min_alpha, min_transmittance,
@@ -387,7 +389,7 @@ def _sum_regions(
     tl.store(out_used + cell - first_cell, slot - first)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["base", "first_slot"])
 def _pack(key, weight, base, used, ends, out_key, out_weight, first_slot, COPIED: tl.constexpr):
     """Move the used slots of a cell directly behind those of the previous cells."""
     cell = tl.program_id(0).to(tl.int64)
@@ -464,7 +466,7 @@ def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, in
     ]
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "columns", "views"])
 def _places(key, splat_keys, first, out_gaussian, out_column, count, columns, views, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = i < count
@@ -505,7 +507,7 @@ _CHANNELS = 8
 """Largest number of channels per program. More channels need more programs, which compute the weights again."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=_SIZES)
 def _composite(
     splats, members, offsets, gaussians, values, image, out_alpha, width, height, channels, cells_across,
     max_alpha, min_alpha, min_transmittance,

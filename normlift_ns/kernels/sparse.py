@@ -28,7 +28,7 @@ class RowNorms(NamedTuple):
     """Number of views with a positive weight."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["segments"])
 def _segment_sum(values, offsets, out, segments, ROWS: tl.constexpr):
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     start = tl.load(offsets + row, mask=row < segments, other=0)
@@ -49,7 +49,7 @@ def segment_sum(values: Float[Tensor, " m"], offsets: Int64[Tensor, " rows_plus_
     return out
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["rows"])
 def _product(offsets, column, weight, vector, out, rows, ROWS: tl.constexpr):
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     start = tl.load(offsets + row, mask=row < rows, other=0)
@@ -268,7 +268,7 @@ class SparseRowsLike(Protocol):
     def weight(self) -> Tensor: ...  # noqa: D102
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["rows"])
 def _row_max(offsets, column, value, out, rows, ROWS: tl.constexpr):
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     start = tl.load(offsets + row, mask=row < rows, other=0)
@@ -293,7 +293,7 @@ def row_max(
     return out
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["first", "columns"])
 def _products(a_offsets, a_column, a_weight, b_offsets, b_column, b_weight, out, first, columns, WIDTH: tl.constexpr):
     """Compute one row of A B per program. Rows of B are added in a fixed order.
 

@@ -72,7 +72,7 @@ def _certain(agreed, r, weight, slot, valid, spread, delta):
     return (wins | (all_high <= own_low + delta)) & (spread < 100.0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["voters"])
 def _vote(
     voters, neighbors, distance, high, low, rough, row_of, reliability, own, source, dimension, k, tau, gamma, width,
     delta, prior, GROUP: tl.constexpr, COLUMNS: tl.constexpr, COLUMNS_LATER: tl.constexpr, STAGES: tl.constexpr,
@@ -213,7 +213,7 @@ def vote(
     )  # fmt: skip
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n"])
 def _find_reliable(neighbors, reliability, out, n, k, ROWS: tl.constexpr, SLOTS: tl.constexpr):
     row, slot = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS), tl.arange(0, SLOTS)
     inside = (row < n)[:, None] & (slot < k)[None, :]
@@ -233,7 +233,7 @@ def has_reliable_neighbor(neighbors: Int32[Tensor, "m k"], reliability: Float[Te
     return mask.bool()
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["voters", "count"])
 def _mark(voters, neighbors, out, count, k, ROWS: tl.constexpr, SLOTS: tl.constexpr):
     row, slot = tl.program_id(0) * ROWS + tl.arange(0, ROWS), tl.arange(0, SLOTS)
     i = tl.load(voters + row, mask=row < count, other=0).to(tl.int64)
