@@ -176,7 +176,7 @@ def row_norms(
         weight: Weights of the entries.
         column_view: View of every column, non-decreasing.
         table: Unit rows F.
-        min_share: Ratio of the norm of a sum to the sum of its weights, below which it is repeated in float64.
+        min_share: A sum is repeated in float64 if its norm is below `min_share` times the sum of its weights.
         max_entries: Number of entries above which a sum is repeated in float64.
     """
     n, dimension, device = len(offsets) - 1, table.shape[1], table.device

@@ -223,7 +223,7 @@ def _find_reliable(neighbors, reliability, out, n, k, ROWS: tl.constexpr, SLOTS:
 
 
 def has_reliable_neighbor(neighbors: Int32[Tensor, "m k"], reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
-    """Return a mask of the Gaussians with a neighbor that has R > 0."""
+    """Return a mask of the Gaussians that have a neighbor with a reliability above 0."""
     n, k = neighbors.shape
     mask = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
     if n > 0:

@@ -30,7 +30,7 @@ With many Gaussians, smaller cells are faster, because the pixels of a cell have
 _MANY = 4_000_000
 """Smallest number of Gaussians for which `SMALL_CELL` is used."""
 _ELEMENTS, _MAX_VIEWS = 2**26, 16
-"""Largest product of the numbers of views in a batch and of Gaussians, and largest number of views in a batch.
+"""Limits of a batch: number of views times number of Gaussians, and number of views.
 
 A view takes one byte per Gaussian and 120 bytes per visible Gaussian.
 """

@@ -229,7 +229,7 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
 def _preferred_regions(options: SourceOptions, device: str) -> list[str]:
     """Return the regions that "auto" can select for the encoder, in order of preference.
 
-    The result does not depend on the weights on this machine. On a CPU, it excludes SAM. It also excludes edges if the
+    The result does not depend on the weights on this machine. On a CPU, it excludes SAM, and also edges if the
     encoder can encode patches, but would encode each region as a crop. Twelve crops through CLIP take longer than all
     patches of an image (`python -m research.edges --clip`).
     """

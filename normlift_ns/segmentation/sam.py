@@ -235,7 +235,7 @@ class _Upscaling(NamedTuple):
     norm: _Norm
 
     def __call__(self, keys: Float[Tensor, "p n c"], mask_channels: Float[Tensor, "p m o"]) -> Float[Tensor, "p m y x"]:
-        """Return the products of the channels of each pixel and the channels of each mask."""
+        """Return logits, the scalar products of the upscaled channels of every pixel with the channels of every mask."""
         if can_use_triton(keys) and keys.dtype != torch.float32:
             from normlift_ns.kernels.sam import upscale_masks  # noqa: PLC0415 (needs Triton)
 
