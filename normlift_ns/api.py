@@ -61,7 +61,13 @@ from normlift_ns.options import (
     check_prompt_list,
     renamed,
 )
-from normlift_ns.pipeline import LiftResult, lift_scene, resolve_gsplat_version
+from normlift_ns.pipeline import (
+    LiftResult,
+    lift_collection,
+    plan_collection,
+    resolve_gsplat_version,
+    start_kernel_warm_up,
+)
 from normlift_ns.progress import ProgressCallback, StageTimer
 from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, make_query, save_query
@@ -203,15 +209,16 @@ class PreparedLift:
 def run_lift(request: LiftRequest) -> LiftedRun:
     """Lift features onto a trained scene, write the lifted run, and return it."""
     prepared, stages = prepare_lift(request), StageTimer(request.report)
-    cameras = prepared.scene.train.cameras
-    refuse_small_memory(len(prepared.scene.gaussians), max((c.width * c.height for c in cameras), default=0))
+    scene, cache, device = prepared.scene, cache_folder(prepared.run_dir), prepared.device
+    cameras = scene.train.cameras
+    refuse_small_memory(len(scene.gaussians), max((c.width * c.height for c in cameras), default=0))
     check_target(prepared)
     announce(prepared)
-    result = lift_scene(
-        prepared.scene, prepared.source, prepared.lift, cache_folder(prepared.run_dir), device=prepared.device,
-        encoder=prepared.encoder, export=request.export, report=request.report,
-        check=partial(check_alignment, prepared, stages),
-    )  # fmt: skip
+    collection = plan_collection(scene, prepared.source, prepared.lift, cache, device=device, export=request.export)
+    collection.start_preparing_regions()
+    kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
+    check_alignment(prepared, stages, kernels.wait_for_rendering)  # while the other kernels are compiled
+    result = lift_collection(collection, kernels, device=device, encoder=prepared.encoder, report=request.report)
     return write_lifted_run(prepared, result, stages)
 
 

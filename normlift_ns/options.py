@@ -505,8 +505,8 @@ class SourceOptions:
     edges. patches: patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
     --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise, auto depends on the encoder. For
     a neural network on a GPU, auto selects the first of sam, edges and patches that this machine and the network
-    support. On a CPU, it never selects sam, and it prefers patches to edges for encoders of crops. In all other cases,
-    auto selects superpixel. Any other name: a mask source from an installed plugin."""
+    support. On a CPU, it never selects sam, and it prefers patches to edges for encoders that encode crops. In all
+    other cases, auto selects superpixel. Any other name: a mask source from an installed plugin."""
     sam3_prompts: tuple[str, ...] = ()
     """Prompts for the masks of --regions sam3. If there are none, SAM 3 uses the prompts of --queries."""
     region_count: int | None = None
@@ -521,7 +521,7 @@ class SourceOptions:
     regions_dir: Path | None = None
     """Folder with one label map per image: a PNG or NPY file with the same stem as the image."""
     regions_background: int = 0
-    """Value of label map pixels that do not belong to a region. Negative values never belong to a region."""
+    """Value of label map pixels that do not belong to a region. Pixels with negative values never belong to one."""
     regions_resample: bool = False
     """Resize label maps to the image size with nearest-neighbor sampling. False: stop with an error if the sizes
     differ."""
@@ -537,7 +537,7 @@ class SourceOptions:
     features_missing: MissingFeatures = "error"
     """Action if images have no precomputed features. error: stop. skip: leave these images out of the lift."""
     text_embeddings: Path | None = None
-    """NPZ file with one vector per prompt, for prompts of precomputed features. It replaces the text encoder."""
+    """NPZ file with one vector per prompt, used instead of the text encoder. It needs --features langsplat."""
 
     def __post_init__(self) -> None:
         if self.regions not in get_args(RegionKind):
@@ -580,10 +580,10 @@ class SplatOptions:
     masks: Path | None = None
     """Folder with one mask per image. The lift ignores pixels with a mask value of zero."""
     world_transform: Path | Literal["auto"] | None = "auto"
-    """Transform from the world of the cameras to that of the splat. auto: none, unless the splat fits its images only
-    after a rotation, normalization or scaling that common tools apply; this transform is then used. A path: a file with
-    a similarity transform as a 4 x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY file.
-    None: no transform, without a search."""
+    """Transform from the world of the cameras to that of the splat. auto: search for a rotation, normalization or
+    scaling that common tools apply, and use it only if the splat does not fit its images without it. A path: a file
+    with a similarity transform as a 4 x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY
+    file. None: no transform, without a search."""
     gsplat_normalize: bool = True
     """Assume that gsplat's trainer normalized the world, which is its default, and recompute the transform from the
     COLMAP project. For a PLY file, --world-transform auto tries this transform among others."""
@@ -657,11 +657,11 @@ class RefineConfig(CheckedOptions):
     median distance from a Gaussian to the nearest one at another position. None: 2 for posterior, 1 for paper."""
     tau: float | None = None
     """Cosine at which the agreement of two directions is one half, in -1..1. Larger values require more similar
-    directions. None: for posterior, a value measured on neighbors that share regions if a consensus changed features,
-    otherwise 0.9; for paper, 0.95."""
+    directions. None: 0.95 for paper. For posterior, 0.9, unless the consensus changed features; tau is then measured on
+    neighbors that share regions."""
     gamma: float | None = None
     """Softness of the agreement around the cosine --vote-tau, > 0. Larger values blur the distinction between similar
-    and different directions. None: for posterior, (1 - tau) / 2 with a measured tau, otherwise 0.05; for paper, 0.4."""
+    and different directions. None: 0.4 for paper. For posterior, 0.05, or (1 - tau) / 2 if tau is measured."""
     delta: float | None = None
     """Margin Delta by which the best neighbor must win the vote, >= 0. Larger values change fewer Gaussians.
     None: 0."""
@@ -701,7 +701,7 @@ class LiftOptions(CheckedOptions):
     """Images that the encoder receives. photos: the training images. render: renders of the trained scene from the same
     cameras."""
     max_views: int | None = None
-    """Maximum number of training views, which are evenly spaced. More views are slower and more reliable. None: all."""
+    """Maximum number of evenly spaced training views. More views are slower and more reliable. None: all."""
     lift_downscale: int = 1
     """Divisor of the size of images and cameras, at least 1. Larger values are faster and coarser."""
     reliability_beta: float = 1.0

@@ -32,15 +32,15 @@ from normlift_ns.core.consensus import (
 )
 from normlift_ns.core.device import load_triton
 from normlift_ns.core.evidence import Entries, Evidence
-from normlift_ns.core.field import SemanticField
+from normlift_ns.core.field import CHANGED_COSINE, SemanticField
 from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.independence import independent_views, pair_reliability
 from normlift_ns.core.left_out import leave_views_out
-from normlift_ns.core.lift import Lifted, lift
+from normlift_ns.core.lift import Lifted, lift, norm_of_reliability
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.null_level import with_null_level
-from normlift_ns.core.refine import CHANGED_COSINE, clamp_k, labeled_share, refine, unsupported
+from normlift_ns.core.refine import clamp_k, labeled_share, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
@@ -80,7 +80,6 @@ def lift_scene(
     encoder: Mapping[str, Any],
     export: FeatureExport | None = None,
     report: ProgressCallback = lambda stage, done, total: None,
-    check: Callable[[Callable[[], None]], None] = lambda wait_for_rendering: None,
 ) -> LiftResult:
     """Lift 2D features onto the Gaussians of a trained scene.
 
@@ -90,18 +89,33 @@ def lift_scene(
         encoder: options that queries need to encode prompts in the same way. The manifest stores them.
         export: folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: progress callback, see `ProgressCallback`.
-        check: function that raises if the scene must not be lifted. Its argument is a function that waits for the
-            kernels of renders, which are compiled meanwhile.
     Raises:
         ValueError, FileNotFoundError: an image, a label map or an option is not valid, or no pixel is labeled.
         MemoryError: the lift does not fit into GPU memory.
     """
-    stages, facts = StageTimer(report), {}
     collection = plan_collection(scene, source, options, cache, device=device, export=export)
-    options, means = collection.options, collection.gaussians.means
-    collection.start_preparing_regions()
-    kernels = start_kernel_warm_up(scene, collection.gaussians, options, collection.config)
-    check(kernels.wait_for_rendering)
+    kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
+    return lift_collection(collection, kernels, device=device, encoder=encoder, report=report)
+
+
+def lift_collection(
+    collection: EvidenceCollection,
+    kernels: KernelWarmUp,
+    *,
+    device: str,
+    encoder: Mapping[str, Any],
+    report: ProgressCallback,
+) -> LiftResult:
+    """Run the steps of a planned lift.
+
+    Args:
+        kernels: result of `start_kernel_warm_up`.
+        device, encoder, report: as in `lift_scene`.
+    Raises:
+        ValueError, FileNotFoundError, MemoryError: as in `lift_scene`.
+    """
+    stages, facts = StageTimer(report), {}
+    options, means, source = collection.options, collection.gaussians.means, collection.source
     views = collection.collect(stages, kernels)
     table = views.features
     if options.consensus:
@@ -259,8 +273,7 @@ def with_stored_reliability(lifted: Lifted, means: Float[Tensor, "n 3"], collect
     kind, beta, scalars = collection.options.reliability, collection.options.reliability_beta, lifted.scalars
     if kind == "paper":
         return lifted
-    views = scalars.n_eff.double()
-    norm = torch.where(views > 0, scalars.reliability.double() * (views + beta) / views, 0.0).clamp(max=1)
+    views, norm = scalars.n_eff.double(), norm_of_reliability(scalars, beta)
     if kind == "angular":
         cameras = (collection.scene.train.cameras[index] for index in collection.views)
         centers = torch.stack([camera.world_to_camera.double().cpu().inverse()[:3, 3] for camera in cameras])

@@ -131,8 +131,13 @@ class Asked(NamedTuple):
     """Cosine of every pixel's region, -1 without one."""
 
 
-def ask(capture: str, config: Path, rule: RelevancyRule = "cosine") -> dict[str, Asked]:
-    """Ask the prototype of every label of a lifted capture, and its word if the encoder knows it."""
+def ask(capture: str, config: Path, rule: RelevancyRule = "cosine", *, step: int = 1) -> dict[str, Asked]:
+    """Ask the prototype of every label of a lifted capture, and its word if the encoder knows it.
+
+    Args:
+        rule: rule of the prototypes.
+        step: keep every step-th pixel, and leave out the words if it is above 1.
+    """
     run, masks = nl.open_run(config), dict(label_masks(capture))
     scene, field = run.scene, run.field
     views = {Path(x.name).stem: x for part in (scene.train, scene.held_out) for x in part}
@@ -142,7 +147,7 @@ def ask(capture: str, config: Path, rule: RelevancyRule = "cosine") -> dict[str,
         name: (name, Query((name,), row[None].numpy(), rule=rule, suggest_threshold=True))
         for name, row in vectors.items()
     }
-    for name in vectors:
+    for name in vectors if step == 1 else ():
         with suppress(InputError):  # a word that the encoder does not know
             asked[f"word {name}"] = (name, make_query(field, run.texts.rows, [name]))
     answers = {key: run_query(field, scene.gaussians.means, question) for key, (_, question) in asked.items()}
@@ -158,9 +163,9 @@ def ask(capture: str, config: Path, rule: RelevancyRule = "cosine") -> dict[str,
         cosines = [(torch.cat([rows[x][0] @ vector, vector.new_tensor([-1])]), rows[x][1]) for x in images]
         found[key] = Asked(
             answers[key],
-            np.concatenate([drawn[image][..., q].numpy().ravel() for image in images]),
-            np.concatenate([masks[image][label].ravel() for image in images]),
-            np.concatenate([cosine[row].numpy().ravel() for cosine, row in cosines]),
+            np.concatenate([drawn[image][..., q].numpy().ravel()[::step] for image in images]),
+            np.concatenate([masks[image][label].ravel()[::step] for image in images]),
+            np.concatenate([cosine[row].numpy().ravel()[::step] for cosine, row in cosines]),
         )
     return found
 

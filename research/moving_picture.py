@@ -21,12 +21,12 @@ from tests.browser.person import chromium, coloured
 from tests.browser.server import OWN, Server
 
 CONFIG = Path("demo/outputs/room/normlift/thing/config.yml")
-PROMPTS = ("banana", ", wine bottle")
+PROMPTS = ("wine bottle", ", banana")
 """What is typed first, and what is added to it."""
-SIZE, WIDTH = (1200, 750), 800
+SIZE, WIDTH = (1200, 750), 1000
 """Size of the page, and width of the picture."""
 POINTER = """
-const pointer = document.createElement("div");
+const pointer = globalThis.pointer = document.createElement("div");
 const arrow = "M3 2v19l5-5 4 9 4-2-4-8h7z";
 pointer.innerHTML = `<svg width="26" height="26"><path d="${arrow}" fill="white" stroke="black"/></svg>`;
 pointer.style.cssText = "position: fixed; z-index: 9999; pointer-events: none; left: 600px; top: 420px";
@@ -92,7 +92,7 @@ class Film:
         """Writes an animated WebP that repeats for ever."""
         first, *others = self.frames
         how = {"save_all": True, "append_images": others, "duration": self.times, "loop": 0}
-        first.save(path, **how, quality=70, method=6, minimize_size=False)
+        first.save(path, **how, quality=80, method=6, minimize_size=False)
         seconds, size = sum(self.times) / 1000, path.stat().st_size
         sys.stdout.write(f"Written: {path}, {len(self.frames)} frames, {seconds:.1f} s, {size / 1e6:.2f} MB\n")
 

@@ -13,11 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-import docstring_parser
-
 from normlift_ns.cli.batch import NormLiftBatch
 from normlift_ns.cli.check import NormLiftCheck
-from normlift_ns.cli.common import OUTPUT_FLAGS_HELP, first_paragraph
+from normlift_ns.cli.common import OUTPUT_FLAGS_HELP, field_docstrings, first_paragraph
 from normlift_ns.cli.evaluate import NormLiftEval
 from normlift_ns.cli.export import NormLiftExport
 from normlift_ns.cli.lift import NormLift
@@ -90,7 +88,7 @@ def _rows(options: Any, names: list[str]) -> Iterator[str]:
     fields = {field.name: field for field in dataclasses.fields(options)}
     texts: dict[str, str] = {}
     for part in filter(dataclasses.is_dataclass, reversed(options.__mro__)):
-        texts |= {p.arg_name: p.description or "" for p in docstring_parser.parse_from_object(part).params}
+        texts |= field_docstrings(part)
     for name in names:
         text = _text(texts[name])
         flag = VOTE_FLAGS[name] if options is RefineConfig and name in VOTE_FLAGS else name

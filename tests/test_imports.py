@@ -69,7 +69,7 @@ FOREIGN = {
     "method_configs": {"nerfstudio"},
     "evaluation": BASE | {"cv2", "msgspec", "matplotlib", "plyfile"},
     "demo": BASE | {"nerfstudio", "matplotlib", "PIL"},
-    "cli": TENSORS | {"numpy", "PIL", "plyfile", "tyro", "rich", "docstring_parser", "prompt_toolkit"},
+    "cli": TENSORS | {"numpy", "PIL", "plyfile", "tyro", "rich", "prompt_toolkit"},
 }
 """What is not of this package and not of Python, by layer."""
 KNOW_NERFSTUDIO = ("nerfstudio_plugin", "method_configs", "data/nerfstudio/dataset_views.py", "demo/capture.py")

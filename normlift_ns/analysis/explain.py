@@ -29,10 +29,9 @@ from normlift_ns import evidence_collection
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.consensus import CHANCE_AGREEMENT, consensus
 from normlift_ns.core.evidence import Evidence
-from normlift_ns.core.field import SemanticField
-from normlift_ns.core.lift import lift
+from normlift_ns.core.field import CHANGED_COSINE, SemanticField
+from normlift_ns.core.lift import lift, norm_of_reliability
 from normlift_ns.core.lowrank import StoredEvidence
-from normlift_ns.core.refine import CHANGED_COSINE
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.base import FeatureSource
@@ -371,6 +370,8 @@ class RecordedVotes:
         store = self.field.store
         if isinstance(store, StoredEvidence):
             return store.evidence, store.features
+        if not any((self.cache / "evidence").glob("*")):  # do not compute regions first, which takes minutes
+            raise self._no_evidence()
         blocks = (self._observe(chunk)[0] for chunk in evidence_collection.chunk_views(range(len(self.names))))
         parts = (evidence_collection.ViewObservations.of_block(block, self._cached_evidence(block)) for block in blocks)
         evidence, features, level = evidence_collection.ViewObservations.merge(parts)
@@ -379,6 +380,19 @@ class RecordedVotes:
             least = self._option("consensus_min_agreement", float, CHANCE_AGREEMENT)
             features = consensus(evidence, features, level=level, power=power, sample=sample, least=least).features
         return evidence, features
+
+    @property
+    def disagreement(self) -> float:
+        """Usual disagreement of the views about a Gaussian: 1 - median ||f_j||, the mean of before and after the
+        consensus.
+        """
+        scalars = self.field.scalars
+        if not bool((scalars.norm > 0).any()):
+            return 1.0
+        norms = [scalars.norm.double()]
+        if self._option("reliability", str, "paper") == "paper":
+            norms.append(norm_of_reliability(scalars, self._option("reliability_beta", float, 1.0)))
+        return 1 - sum(float(norm[norm > 0].median()) for norm in norms) / len(norms)
 
     def _cached_evidence(self, block: evidence_collection.ViewBatch) -> Evidence:
         config = evidence_collection.RasterConfig(
@@ -393,11 +407,14 @@ class RecordedVotes:
             self.scene.gaussians, block, self.cache / "evidence", config
         )
         if evidence is None:
-            raise InputError(
-                f"{self.cache / 'evidence'} no longer has the evidence of the lift, and the run has only directions; "
-                f"{REMEDY}. With --storage evidence, a lift stores the evidence in the run."
-            )
+            raise self._no_evidence()
         return evidence
+
+    def _no_evidence(self) -> InputError:
+        return InputError(
+            f"{self.cache / 'evidence'} no longer has the evidence of the lift, and the run has only directions; "
+            f"{REMEDY}. With --storage evidence, a lift stores the evidence in the run."
+        )
 
     def _observe(self, views: Sequence[int]) -> tuple[evidence_collection.ViewBatch, list[Tensor]]:
         """Return labels, regions and features of some lifted images, and the images at the resolution of the lift."""

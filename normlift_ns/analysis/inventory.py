@@ -2,8 +2,8 @@
 
 Two neighboring Gaussians get a count from each image in which both have a region. The count is 1 if both have the same
 region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s = 1 - median ||f_j||
-measures how much the views usually disagree. The affinity of two parts is the mean of the counts over all images and
-all pairs of neighbors across their border::
+measures how much the views usually disagree, the mean of before and after the consensus. The affinity of two parts is
+the mean of the counts over all images and all pairs of neighbors across their border::
 
     a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
 
@@ -162,9 +162,8 @@ def list_inventory(
         ValueError, FileNotFoundError: as in `RecordedVotes.table` and `make_catalogue`.
     """
     scene, field = votes.scene, votes.field
-    (evidence, features), norm = votes.table, field.scalars.norm
-    spread = 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
-    instance_id = find_inventory(evidence, features, scene.gaussians.means, spread)
+    evidence, features = votes.table
+    instance_id = find_inventory(evidence, features, scene.gaussians.means, votes.disagreement)
     names = name_objects(field, instance_id, mean_directions(evidence, features, instance_id), vocabulary)
     instances = as_instances(instance_id, names)
     catalog = make_catalogue(scene, field, instances, transform, meters_per_unit=meters_per_unit, device=device)
@@ -185,7 +184,7 @@ def find_inventory(
     Args:
         features: one unit row per column (region) of the evidence.
         means: centers of the Gaussians.
-        spread: 1 - median ||f_j||, the usual disagreement of the views about a Gaussian.
+        spread: usual disagreement of the views about a Gaussian, `RecordedVotes.disagreement`.
     """
     evidence = evidence.to("cpu")
     part = _join(len(means), _neighbor_borders(view_regions(evidence), features.cpu(), means.cpu(), spread))

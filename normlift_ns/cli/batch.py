@@ -508,8 +508,8 @@ class NormLiftBatch(CheckedOptions):
     already lifted with the same options."""
 
     captures: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURES")]
-    """Text file with one capture per line: the path of a config.yml, a PLY file or a gsplat checkpoint. Options of
-    ns-normlift for this capture may follow the path."""
+    """Text file with one capture per line: the path of a config.yml, a splat file or a gsplat checkpoint. Options of
+    ns-normlift for this capture may follow or replace the path."""
     options: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[-- OPTIONS]")] = ()
     """Options of ns-normlift that apply to all captures, given after --."""
     results: Path | None = None

@@ -23,7 +23,8 @@ from normlift_ns.io.atomic import write_text_file
 from normlift_ns.options import SourceOptions, renamed
 
 if TYPE_CHECKING:
-    from normlift_ns.planning import Diagnostic, Plan
+    from normlift_ns.encoders.base import FeatureSource
+    from normlift_ns.planning import Diagnostic, OpenedCapture, Plan
 
 
 _Result = TypeVar("_Result")
@@ -98,10 +99,16 @@ class NormLiftCheck(NormLift):
             stand_in = "without these weights, the plan describes a lift with --encoder color"
             advice = "add the time of the networks, or fetch the weights and check again"
             rows.append(Diagnostic("plan", "warning", stand_in, advice))
+        return rows, self._plan(rows, opened, source, device)
+
+    def _plan(self, rows: list[Diagnostic], opened: OpenedCapture, source: FeatureSource, device: str) -> Plan | None:
+        """Plan the lift, and add findings about its memory and its disk space."""
+        from normlift_ns import planning  # noqa: PLC0415
+
         plan = _try(rows, "plan", lambda: planning.plan_opened(opened, source, self.lift, device, self.num_devices))
         if plan is not None:
             rows += [*planning.diagnose_memory(plan, device), planning.diagnose_disk(plan, opened.run_dir)]
-        return rows, plan
+        return plan
 
 
 def _try(rows: list[Diagnostic], name: str, function: Callable[[], _Result]) -> _Result | None:

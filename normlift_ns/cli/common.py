@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import atexit
+import inspect
 import io
 import os
 import re
@@ -19,11 +21,11 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, redi
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from types import FrameType
 from typing import IO, Annotated, Any, NamedTuple, NoReturn, Protocol, TextIO, TypeVar, cast, get_type_hints
 
-import docstring_parser
 import tyro
 from rich.console import Console
 from rich.text import Text
@@ -530,8 +532,7 @@ def add_help_texts(options: Any, *, nested: bool = False) -> Any:
     hints = get_type_hints(options, include_extras=True)
     texts: dict[str, str] = {}
     for cls in filter(is_dataclass, reversed(options.__mro__)):  # a command may inherit flags
-        params = docstring_parser.parse_from_object(cls).params
-        texts |= {param.arg_name: param.description or "" for param in params}
+        texts |= field_docstrings(cls)
     for field in fields(options):
         hint, text = hints[field.name], texts.get(field.name, "")
         name = VOTE_FLAGS.get(field.name) if options is RefineConfig else None
@@ -542,6 +543,24 @@ def add_help_texts(options: Any, *, nested: bool = False) -> Any:
         conf = tyro.conf.arg(name=name, help=" ".join(text.split()), help_behavior_hint=default)
         options.__annotations__[field.name] = Annotated[hint, conf]
     return options
+
+
+@cache
+def _class_definitions(module: str) -> dict[str, list[ast.stmt]]:
+    """Return the statements of every class at the top level of a loaded module; none without its source."""
+    with suppress(OSError):
+        tree = ast.parse(inspect.getsource(sys.modules[module]))
+        return {node.name: node.body for node in tree.body if isinstance(node, ast.ClassDef)}
+    return {}
+
+
+def field_docstrings(options: type) -> dict[str, str]:
+    """Return the docstring under each field of a dataclass, by the name of the field."""
+    texts: dict[str, str] = {}
+    for field, text in pairwise(_class_definitions(options.__module__).get(options.__name__, [])):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            texts[ast.unparse(field.target)] = str(text.value.value)
+    return texts
 
 
 def first_paragraph(options: Any) -> str:

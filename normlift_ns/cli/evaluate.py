@@ -52,12 +52,13 @@ class NormLiftEval(CheckedOptions):
     """Additional studies, which load all runs into memory. ablation: scores of variants of the refinement, with and
     without consensus. sweeps: scores for several values of each vote parameter, around the value of the run, and for
     the default. signals: the share of Gaussians without evidence, accuracy by R and by norm, and a comparison of R with
-    opacity. timing: seconds of the lift and, on a GPU, of SFS's method (512 channels through gsplat). baselines: scores
-    of ideas of SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage: regions without
-    reliable evidence, unused images that would help, and new camera poses, as renders and as a camera path."""
+    opacity. timing: seconds of the lift and, on a GPU, of SFS's method (512 channels through gsplat). baselines:
+    accuracy of techniques from SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage:
+    regions without reliable evidence, unused images that would help, and new camera poses, as renders and as a camera
+    path."""
     compare: Literal["paper"] | None = None
-    """Published results to compare with yours, in print and in the output file. paper: results of the paper for
-    --protocol scannet and lerf, and for the studies ablation, signals and timing."""
+    """Published results to compare with yours, in the printed tables and in the output file. paper: results of the
+    paper for --protocol scannet and lerf, and for the studies ablation, signals and timing."""
     text_embeddings: Path | None = None
     """NPZ file with one vector per class name, used instead of the text encoder of the runs."""
     data: Path | None = None

@@ -64,8 +64,8 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
 @renamed(check="check_alignment")
 @dataclass
 class NormLift(CheckedOptions):
-    """Lift 2D features onto the Gaussians of a trained splat, without training. The splat is a splatfacto run, a PLY
-    file or a checkpoint of gsplat's trainer."""
+    """Lift 2D features onto the Gaussians of a trained splat, without training. The splat is a splatfacto run, a
+    splat file such as PLY or SPZ, or a checkpoint of gsplat's trainer."""
 
     load_config: Path | None = None
     """Path to the config.yml file of the trained run."""

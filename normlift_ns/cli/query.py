@@ -111,7 +111,7 @@ class NormLiftQuery(CheckedOptions):
     If there are more than 40 objects, the table counts them for each prompt and lists the 10 largest."""
     objects_dir: Path | None = None
     """Folder for the list of --objects in capture and scene coordinates, with the axes of the boxes. The files are
-    objects.json and objects.csv, and the meshes objects.ply and objects_scene.ply of the boxes. docs/objects.md
+    objects.json and objects.csv, and objects.ply and objects_scene.ply with the meshes of the boxes. docs/objects.md
     explains every column."""
     meters_per_unit: float | None = None
     """Length of one capture unit in meters for --objects, > 0. If given, the table of objects is in meters, in the
@@ -420,8 +420,10 @@ def read_vocabulary(path: Path) -> list[str]:
     return words
 
 
-_HELP = """Separate prompts by commas. Put a prompt that contains a comma in double quotes: "salt, pepper".
-help: print this text. exit, quit or Ctrl-D: end. To search for one of these words, write it in double quotes."""
+_HELP = (
+    'Separate prompts by commas. Put a prompt that contains a comma in double quotes: "salt, pepper".',
+    "help: print this text. exit, quit or Ctrl-D: end. To search for one of these words, write it in double quotes.",
+)
 
 
 def run_repl(
@@ -457,7 +459,8 @@ def run_repl(
         if text in ("exit", "quit"):
             return
         if text in ("help", "?"):
-            common.info(_HELP)
+            for line in _HELP:
+                common.info(line)
             continue
         prompts = split_prompts(text)
         if len(prompts) == 0:

@@ -206,6 +206,17 @@ def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], b
     return torch.where(n_eff > 0, norm * n_eff / (n_eff + beta), 0.0)
 
 
+def norm_of_reliability(scalars: Scalars, beta: float) -> Float64[Tensor, " n"]:
+    """Return ||f_j|| from R_j, the inverse of `reliability`. After a consensus, it is the norm before the consensus.
+
+    Args:
+        scalars: scalars of a lift with the paper's R.
+        beta: prior strength, as for `reliability`.
+    """
+    views = scalars.n_eff.double()
+    return torch.where(views > 0, scalars.reliability.double() * (views + beta) / views, 0.0).clamp(max=1)
+
+
 def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
     if features.shape[0] != evidence.num_regions:
         raise InputError(

@@ -30,8 +30,8 @@ def read_antimatter(path: Path) -> SplatFile:
         data = file.read()
     if len(data) == 0 or len(data) % _ROW.itemsize != 0:
         raise InputError(
-            f"{path} is truncated or not a .splat file: it has {len(data):,} bytes, expected a multiple of "
-            f"{_ROW.itemsize}. Copy it again."
+            f"{path} is truncated or not a .splat file: it has {len(data):,} bytes, expected a positive "
+            f"multiple of {_ROW.itemsize}. Copy it again."
         )
     rows = np.frombuffer(data, _ROW)
     scales, colors = torch.from_numpy(rows["scales"].copy()), torch.from_numpy(rows["colors"].astype(np.float32))

@@ -144,8 +144,8 @@ def _check_element(path: Path, element: str, table: np.ndarray | None, names: tu
     wrong = [name for name in names if name not in types or types[name].kind != kind]
     if len(wrong) > 0:
         raise InputError(
-            f"{path} is a compressed PLY file, but its element {element!r} has no valid {', '.join(wrong)}. Write it "
-            "again, or give the uncompressed PLY file."
+            f"{path} is a compressed PLY file, but its element {element!r} has no valid {', '.join(wrong)}. Write the "
+            "file again, or give the uncompressed PLY file."
         )
 
 

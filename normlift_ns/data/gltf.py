@@ -207,7 +207,9 @@ def _open_gltf(path: Path) -> _Gltf:
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise _damaged(path, f"its JSON cannot be read ({error})") from error
     if not str(document.asset.get("version", "")).startswith("2."):
-        raise InputError(f"{path} is glTF {str(document.asset.get('version'))[:20]!r}, expected 2.0. Export glTF 2.0.")
+        raise InputError(
+            f"{path} has glTF version {str(document.asset.get('version'))[:20]}, expected 2.0. Export glTF 2.0."
+        )
     unknown = sorted(set(document.extensions_required) - _KNOWN)
     if len(unknown) > 0:
         raise InputError(
@@ -288,16 +290,7 @@ def _harmonic(degree: int, index: int) -> str:
 
 def _read_accessor(gltf: _Gltf, index: int, name: str, size: int) -> Float[np.ndarray, "n c"]:
     """Return the numbers of an accessor as float32; normalized integers are scaled to 0..1 or -1..1."""
-    accessors = gltf.document.accessors
-    accessor = accessors[index] if 0 <= index < len(accessors) else None
-    kind = None if accessor is None else _TYPES.get(accessor.component_type)
-    if accessor is not None and (accessor.sparse is not None or accessor.buffer_view is None):
-        raise InputError(
-            f"{gltf.path} has {name} in a sparse accessor, expected a dense one. Export it without sparse accessors, "
-            "or as a PLY file."
-        )
-    if accessor is None or kind is None or _SIZES.get(accessor.type) != size:
-        raise _damaged(gltf.path, f"{name} is not an accessor of {size} numbers")
+    accessor, kind = _find_accessor(gltf, index, name, size)
     view, data = _view_bytes(gltf, accessor.buffer_view)
     dtype = np.dtype(kind)
     stride = dtype.itemsize * size if view.byte_stride is None else view.byte_stride
@@ -307,6 +300,21 @@ def _read_accessor(gltf: _Gltf, index: int, name: str, size: int) -> Float[np.nd
     shape, strides = (accessor.count, size), (stride, dtype.itemsize)
     values = np.ndarray(shape, dtype, data, accessor.byte_offset, strides).astype(np.float32)
     return np.maximum(values / np.iinfo(dtype).max, -1) if accessor.normalized and dtype.kind != "f" else values
+
+
+def _find_accessor(gltf: _Gltf, index: int, name: str, size: int) -> tuple[_Accessor, str]:
+    """Return a dense accessor of rows of `size` numbers, and the type of these numbers."""
+    accessors = gltf.document.accessors
+    accessor = accessors[index] if 0 <= index < len(accessors) else None
+    if accessor is not None and (accessor.sparse is not None or accessor.buffer_view is None):
+        raise InputError(
+            f"{gltf.path} has {name} in a sparse accessor, expected a dense one. Export it without sparse accessors, "
+            "or as a PLY file."
+        )
+    kind = None if accessor is None else _TYPES.get(accessor.component_type)
+    if accessor is None or kind is None or _SIZES.get(accessor.type) != size:
+        raise _damaged(gltf.path, f"{name} is not an accessor of {size} numbers")
+    return accessor, kind
 
 
 def _view_bytes(gltf: _Gltf, index: object) -> tuple[_BufferView, memoryview]:

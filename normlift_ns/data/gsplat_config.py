@@ -43,36 +43,36 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     """
     folder = splat.parent.parent if splat.parent.name in _FOLDERS else splat.parent
     path = next((folder / name for name in _NAMES if (folder / name).is_file()), None)
-    if path is None:
-        return None
-    if path.stat().st_size > _MAX_BYTES:
-        raise InputError(f"{path} has {path.stat().st_size:,} bytes, expected at most {_MAX_BYTES:,}. {_ADVICE}")
-    try:
-        root = yaml.compose(read_text(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
-        raise InputError(f"{path} is not valid YAML ({describe_yaml_error(error)}). {_ADVICE}") from error
-    if config_string(root, "result_dir") is None or config_string(root, "data_dir") is None:
+    root = None if path is None else _parse(path)
+    if path is None or config_string(root, "result_dir") is None or config_string(root, "data_dir") is None:
         return None  # another program wrote the file
-    texts = {name: config_string(root, name) for name in ("camera_model", "model_type", "test_every")}
-    flags = {name: _flag(path, root, name) for name in ("antialiased", "normalize_world_space", *_OF_3DGUT)}
-    of_3dgut = next((name for name in _OF_3DGUT if flags[name] is True), None)
-    _check_primitive(path, texts["camera_model"], texts["model_type"], of_3dgut)
-    test_every = texts["test_every"]
-    if test_every is not None and not (test_every.isdecimal() and 0 < int(test_every) < 10**9):
-        raise InputError(f"{path} has test_every {test_every[:40]!r}, expected a whole number above 0. {_ADVICE}")
-    antialiased = flags["antialiased"]
+    primitive, antialiased = _primitive(path, root), _flag(path, root, "antialiased")
     mode = None if antialiased is None else "antialiased" if antialiased else "classic"
-    primitive = cast("Primitive | None", texts["model_type"])
     near, far = (_number(path, root, name) for name in ("near_plane", "far_plane"))
-    planes = None if near is None or far is None else (near, far)
     return GsplatConfig(
         path,
         "classic" if primitive == "2dgs" else mode,
-        flags["normalize_world_space"],
-        None if test_every is None else int(test_every),
+        _flag(path, root, "normalize_world_space"),
+        _test_every(path, root),
         primitive,
-        planes,
+        None if near is None or far is None else (near, far),
     )
+
+
+def _parse(path: Path) -> yaml.Node | None:
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(f"{path} has {path.stat().st_size:,} bytes, expected at most {_MAX_BYTES:,}. {_ADVICE}")
+    try:
+        return yaml.compose(read_text(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
+        raise InputError(f"{path} is not valid YAML ({describe_yaml_error(error)}). {_ADVICE}") from error
+
+
+def _test_every(path: Path, root: yaml.Node | None) -> int | None:
+    text = config_string(root, "test_every")
+    if text is not None and not (text.isdecimal() and 0 < int(text) < 10**9):
+        raise InputError(f"{path} has test_every {text[:40]!r}, expected a whole number above 0. {_ADVICE}")
+    return None if text is None else int(text)
 
 
 def _number(path: Path, root: yaml.Node | None, name: str) -> float | None:
@@ -95,15 +95,17 @@ def _flag(path: Path, root: yaml.Node | None, name: str) -> bool | None:
     return None if text is None else text == "true"
 
 
-def _check_primitive(path: Path, camera_model: str | None, model_type: str | None, of_3dgut: str | None) -> None:
-    if of_3dgut is not None:
-        problem = f"{of_3dgut} true (3DGUT), which renders Gaussians differently"
+def _primitive(path: Path, root: yaml.Node | None) -> Primitive | None:
+    model_type, camera_model = config_string(root, "model_type"), config_string(root, "camera_model")
+    of_3dgut = [name for name in _OF_3DGUT if _flag(path, root, name)]
+    if len(of_3dgut) > 0:
+        problem = f"{of_3dgut[0]} true (3DGUT), which renders Gaussians differently"
     elif model_type not in (None, "3dgs", "2dgs"):
         problem = f"model_type {model_type[:40]}, which renders Gaussians differently"
     elif camera_model not in (None, "pinhole"):
         problem = f"camera_model {camera_model[:40]}"
     else:
-        return
+        return cast("Primitive | None", model_type)
     raise InputError(
         f"According to {path}, the splat was trained with {problem}. Expected 3D or 2D Gaussians and pinhole cameras. "
         "Train the scene again with simple_trainer.py or simple_trainer_2dgs.py and undistorted images."

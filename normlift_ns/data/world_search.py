@@ -46,7 +46,7 @@ this."""
 _SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 _ROUND = 1e-3
-"""Relative distance below which a scale is rounded to two digits."""
+"""Relative change below which a scale is rounded to two digits instead of five."""
 
 
 class _Points(NamedTuple):

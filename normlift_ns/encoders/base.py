@@ -497,7 +497,7 @@ class PrecomputedFeatures:
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         check_prompts(prompts)
-        return torch.from_numpy(look_up_embeddings(prompts, self.texts, "the argument texts"))
+        return torch.from_numpy(look_up_embeddings(prompts, self.texts, "the argument `texts`"))
 
 
 def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: Sequence[str]) -> PrecomputedFeatures:

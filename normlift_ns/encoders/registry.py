@@ -78,7 +78,7 @@ class EncoderKind:
     suggested: tuple[float, float] = (0.4, 0.8)
     """Range of suggested thresholds between the median (0) and the top (1) of the relevancies."""
     present_from: tuple[float, float] | None = None
-    """Lower limits on the largest cosine of a prompt, for a weak match and for a match. None: see `query.presence`."""
+    """Lower limits on the largest cosine of a prompt, for a weak match and for a match. None: see `query.engine`."""
     learned: bool = True
     """True if a network processes the images, so that better regions improve its features."""
     pools: bool = False

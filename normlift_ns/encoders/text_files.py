@@ -235,11 +235,11 @@ def look_up_embeddings(prompts: Sequence[str], vectors: Mapping[str, Any], origi
         if prompt not in vectors:
             near = difflib.get_close_matches(prompt, vectors) or list(vectors)[:5]
             hint = (
-                f"which has {len(vectors)} for other prompts; use one of these, such as {', '.join(near)}"
+                f"use one of its {len(vectors)} prompts, such as {', '.join(near)}"
                 if len(vectors) > 0
-                else "which is empty; write the vectors of your prompts to it"
+                else "it is empty, add the vectors of your prompts"
             )
-            raise InputError(f"prompt {truncate_text(prompt)!r} has no vector in {origin}, {hint}")
+            raise InputError(f"prompt {truncate_text(prompt)!r} has no vector in {origin}; {hint}")
     return np.stack([unit_rows(vectors[prompt]) for prompt in prompts])
 
 
@@ -301,12 +301,11 @@ class CachedTextEncoder(LazyTextEncoder):
         paths = {key: self._path("\n".join(key)) for key in keys}
         blocks = {key: self._load(path, len(key)) for key, path in paths.items()}
         new = [key for key, block in blocks.items() if block is None]
-        made = self._encoder.text([prompt for key in new for prompt in key]).numpy() if len(new) > 0 else np.empty(0)
-        for key, block in zip(new, np.split(made, len(new)) if len(new) > 0 else []):
-            blocks[key], path = block, paths[key]
-            if path is not None:
-                with suppress(OSError):
-                    save_arrays(path, {_ARRAY: block[0] if len(key) == 1 else block}, key=path.stem, overwrite=True)
+        if len(new) > 0:
+            made = self._encoder.text([prompt for key in new for prompt in key]).numpy()
+            for key, block in zip(new, np.split(made, len(new))):
+                blocks[key] = block
+                self._store(paths[key], block)
         rows = {prompt: row for key, block in blocks.items() if block is not None for prompt, row in zip(key, block)}
         return np.stack([rows[prompt] for prompt in prompts])
 
@@ -325,6 +324,12 @@ class CachedTextEncoder(LazyTextEncoder):
 
     def _path(self, prompt: str) -> Path | None:
         return None if self.folder is None else cache_path(self.folder, self.identity, prompt.encode())
+
+    def _store(self, path: Path | None, block: Float32[np.ndarray, "q d"]) -> None:
+        """Write the vectors of some prompts to the cache; do nothing if it cannot be written."""
+        if path is not None:
+            with suppress(OSError):
+                save_arrays(path, {_ARRAY: block[0] if len(block) == 1 else block}, key=path.stem, overwrite=True)
 
     def _load(self, path: Path | None, count: int) -> Float32[np.ndarray, "q d"] | None:
         """Return the cached vectors of some prompts, or None if they are missing, damaged or not unit vectors."""

@@ -125,7 +125,7 @@ class NormLiftModel(SplatfactoModel):
             compile_renderer()
 
     def attach(self, semantic_field: SemanticField, question: Query | None = None) -> None:
-        """Attach a field, so that the model renders it with the answer to a query, and enable the panel."""
+        """Attach a field to the model and enable the panel. If a query is given, also show its answer."""
         self._field = semantic_field.to(self.device)
         self.normlift.open(self._field, self.means.detach(), self.config.semantics, question)
 

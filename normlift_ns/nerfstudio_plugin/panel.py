@@ -335,7 +335,7 @@ class SearchPanel(Controller):
         self._overlay_due = False
         self._detail_turns = RequestTokens()
         self._encoder: list[LazyTextEncoder] = []
-        """The text encoder as the only item, or empty before the first prompt."""
+        """List with the text encoder as its only item; an empty list before the first prompt."""
         self._clicks = ClickListener(self._on_click)
         self._handlers[Action.COLORS] = lambda colormap, _: self._set_colormap(colormap)
         self._handlers[Action.REPLACE] = lambda *_: self._save(replaces=True)

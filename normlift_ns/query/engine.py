@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
@@ -29,7 +30,6 @@ from normlift_ns.core.relevancy import (
 )
 from normlift_ns.encoders.registry import EncoderKind, find_encoder_kind
 from normlift_ns.options import RelevancyRule
-from normlift_ns.query.presence import Verdict, compares_cosines, judge
 from normlift_ns.query.question import Query, as_numpy
 from normlift_ns.query.text_encoder import HasManifest, encoder_name
 
@@ -39,6 +39,9 @@ if TYPE_CHECKING:
     from normlift_ns.analysis.objects import SceneObject
     from normlift_ns.core.field import SemanticField
 
+Verdict = Literal["found", "weak match", "probably not here"]
+"""Presence of a prompt. found: it matches better than almost all unrelated words. probably not here: it matches no
+better than many of them."""
 _CENTRAL = (0.05, 0.95)
 """Quantiles of the selected centers that bound their extent."""
 _SUMMARIZED = ("reliability", "weight")
@@ -551,3 +554,55 @@ def _median_and_top(values: np.ndarray) -> tuple[float, float]:
     median, top = (float(np.quantile(values[int(x) : int(x) + 2], x - int(x))) for x in places)
     least = float(values[0])
     return (least if top - median < _AT_TOP * (top - least) else median), top
+
+
+# Presence of prompts in a scene.
+#
+# The rank of a prompt is the fraction of the null vocabulary whose best cosine is lower than that of the prompt. The
+# limits on the rank fix the rate of false positives: with every encoder, one unrelated word in ten is "found". The
+# color encoder has limits on the cosine instead. Without a null vocabulary of at least 100 words, the verdict depends
+# on the relevancy, which compares the prompt with the negatives. docs/honest_answers.md has the counts.
+
+
+_FOUND_RANK, _WEAK_RANK = 0.9, 0.7
+"""Minimum ranks of a prompt for the verdicts "found" and "weak match"."""
+_FEWEST_NULL_WORDS = 100
+"""Minimum number of null words for a meaningful rank."""
+
+
+def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
+    """Return the fraction of null words with a lower best cosine, in 0..1; None if the field has too few null words."""
+    tops = (manifest.get("null_words") or {}).get("tops", ())
+    return bisect_left(tops, top_cosine) / len(tops) if len(tops) >= _FEWEST_NULL_WORDS else None
+
+
+def compares_cosines(manifest: Mapping[str, Any], encoder: str | None) -> bool:
+    """Return whether `judge` uses cosines (with limits of the encoder or null words) instead of relevancies."""
+    kind = find_encoder_kind(encoder)
+    return (kind is not None and kind.present_from is not None) or null_rank(manifest, 0.0) is not None
+
+
+def judge(
+    manifest: Mapping[str, Any], encoder: str | None, rule: RelevancyRule, *, top_cosine: float, top: float
+) -> Verdict | None:
+    """Return the verdict on a prompt; None if there are no null words, limits or negatives to compare with.
+
+    Args:
+        manifest: Manifest of the field.
+        encoder: Name of the encoder of the field.
+        rule: Relevancy rule of the query.
+        top_cosine: Cosine that one Gaussian in a thousand exceeds.
+        top: Relevancy that one Gaussian in a thousand exceeds.
+    """
+    kind, rank = find_encoder_kind(encoder), null_rank(manifest, top_cosine)
+    if kind is not None and kind.present_from is not None:
+        return _by_limits(top_cosine, kind.present_from)
+    if rank is not None:
+        return _by_limits(rank, (_WEAK_RANK, _FOUND_RANK))
+    settings = RELEVANCY_RULES[rule]
+    return None if settings.presence_limit is None else _by_limits(top, (settings.threshold, settings.presence_limit))
+
+
+def _by_limits(value: float, limits: tuple[float, float]) -> Verdict:
+    weak, found = limits
+    return "found" if value >= found else "weak match" if value >= weak else "probably not here"

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 from normlift_ns.encoders.registry import (
     absolute_paths,
+    canonical_name,
     encoder_kind,
     find_encoder_kind,
     make_encoder,
@@ -197,10 +198,10 @@ def _options(field: HasManifest) -> SourceOptions:
 
 
 def encoder_name(field: HasManifest) -> str | None:
-    """Return the name of the encoder of a field; None if the manifest does not record it."""
+    """Return the documented name of the encoder of a field; None if the manifest does not record it."""
     stored = field.manifest.get("encoder")
     name = stored.get("encoder") if isinstance(stored, Mapping) else None
-    return name if isinstance(name, str) else None
+    return canonical_name(name) if isinstance(name, str) else None
 
 
 def own_words(field: HasManifest) -> tuple[str, ...]:

@@ -28,8 +28,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_file, atomic_files, numbered_paths, safe_file_name
 from normlift_ns.options import WEAK_RELIABILITY
-from normlift_ns.query.engine import Answer, Finding
-from normlift_ns.query.presence import Verdict
+from normlift_ns.query.engine import Answer, Finding, Verdict
 from normlift_ns.rasterization.rasterize import render, render_image, render_with_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering import colors
@@ -461,12 +460,8 @@ def save_overlays(
         OSError: A file cannot be written.
         ValueError: Two figures would have the same name.
     """
-    prefixes = [*([CONTACT_SHEET_PREFIX] if len(cameras) > 1 else []), *cameras]
     ends = [f"{q}_{safe_file_name(text)}.png" for q, text in enumerate(answer.texts)]
-    counts = Counter(f"{prefix}_{end}" for prefix in prefixes for end in ends)
-    duplicates = [name for name, count in counts.items() if count > 1]
-    if len(duplicates) > 0:
-        raise InputError(f"two figures would have the name {folder / duplicates[0]}. Render the views one at a time.")
+    _check_figure_names(folder, [*([CONTACT_SHEET_PREFIX] if len(cameras) > 1 else []), *cameras], ends)
     headers = [FigureHeader.of(finding) for finding in answer]
     display = make_display(answer.field, answer)
     sheet = FigureStyle(colors.COLORMAPS[0], display.map_scale, answer.question.threshold)
@@ -498,6 +493,13 @@ def save_overlays(
 
         paths += prefetch_map(save_sheet, range(len(ends)), _THREADS)
     return paths
+
+
+def _check_figure_names(folder: Path, prefixes: Sequence[str], ends: Sequence[str]) -> None:
+    counts = Counter(f"{prefix}_{end}" for prefix in prefixes for end in ends)
+    duplicates = [name for name, count in counts.items() if count > 1]
+    if len(duplicates) > 0:
+        raise InputError(f"two figures would have the name {folder / duplicates[0]}. Render the views one at a time.")
 
 
 class _Overlay(NamedTuple):

@@ -277,8 +277,9 @@ class LabelFiles(RegionDefaults):
             bits = gray_bit_depth(path)
             if bits in (2, 4):
                 raise InputError(
-                    f"{what} is a grayscale PNG with {bits} bits per pixel, whose values image readers multiply by "
-                    f"{255 // (2**bits - 1)}; save it as grayscale with 8 or 16 bits, as an indexed PNG, or as NPY"
+                    f"{what} is a grayscale PNG with {bits} bits per pixel. Image readers multiply the values of "
+                    f"such files by {255 // (2**bits - 1)}. Save it as "
+                    "grayscale with 8 or 16 bits, as an indexed PNG, or as NPY"
                 )
         if maps.ndim == 3 and path.suffix == ".png":
             raise InputError(

@@ -161,7 +161,7 @@ def features(served: ServedRun, query: Any) -> Content:
 
 def inventory(served: ServedRun, query: Any) -> dict[str, Any]:
     """List the main objects of the scene, found without prompts, with their boxes."""
-    with served.reading:
+    with served.analyzing:
         return served.run.inventory().catalog.to_json()
 
 

@@ -94,7 +94,9 @@ class ServedRun:
     run: LiftedRun
     max_gaussians: int
     reading: threading.Lock = field(default_factory=threading.Lock)
-    """Lock for the text encoder and the votes, so that no two threads load them."""
+    """Lock for the text encoder, so that no two threads load it."""
+    analyzing: threading.Lock = field(default_factory=threading.Lock)
+    """Lock for votes, floaters and the inventory, which take seconds, so that no two threads compute them."""
     _memories: OrderedDict[str, PageMemory] = field(default_factory=OrderedDict)
     _results: OrderedDict[bytes, tuple[Any, int]] = field(default_factory=OrderedDict)
     _memory_lock: threading.Lock = field(default_factory=threading.Lock)
@@ -200,7 +202,7 @@ class ServedRun:
     @cached_property
     def floaters(self) -> Bool[torch.Tensor, " n"]:
         """Mask of the likely floaters, which are Gaussians that are not part of a surface."""
-        with self.reading:
+        with self.analyzing:
             return find_floaters(self.run.scene.gaussians, self.run.field.scalars).mask
 
     def describe(self, *, read_only: bool) -> dict[str, Any]:
@@ -334,13 +336,13 @@ class ServedRun:
 
     def warm_up(self) -> None:
         """Compute in advance the data that the first page needs."""
-        _ = self.geometry, self.examples, self.first_view, self.space.neighbor_pairs
+        _ = self.geometry, self.examples
         view = self.first_view
         if view is not None:
             codes = Codes([(0, 0, 0, 0.0, 0)], np.zeros(len(self.rows), np.uint8))
             self.still(codes, view.camera(64))  # compiles the renderer
             self.weights(view.position, np.subtract(view.look_at, view.position).tolist())
-        _ = self.pca
+        _ = self.space.neighbor_pairs, self.pca
 
     @property
     def in_use(self) -> bool:
@@ -415,6 +417,14 @@ class RunStore:
                     if sum(size for _, size in self._open.values()) > self._limit:
                         del self._open[other]
             return served
+
+    def warm_up(self) -> None:
+        """Compute in advance the data that the first page of each open run needs, one run after another."""
+        for name in self.ids:
+            with self._lock:
+                served, _ = self._open.get(name, (None, 0))
+            if served is not None:
+                served.warm_up()
 
 
 def _estimated_bytes(run: LiftedRun) -> int:

@@ -69,7 +69,7 @@ class State:
 
     @cached_property
     def selection_before_resize(self) -> Bool[Tensor, " n"]:
-        """Mask of the Gaussians selected by prompts and clicks, before growing or shrinking."""
+        """Mask of the Gaussians selected by prompts or by hand, before the selection is grown or shrunk."""
         mask = self.space.empty_mask()
         if self.answer is not None and self.prompts_select:
             mask = self.answer.mask if self.shown is None else self.answer.selected[:, self.shown]

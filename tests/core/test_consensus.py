@@ -11,7 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence
-from normlift_ns.core.consensus import apply_consensus, consensus, region_overlaps, sample_gaussians
+from normlift_ns.core.consensus import (
+    apply_consensus,
+    consensus,
+    region_overlaps,
+    sample_gaussians,
+    with_original_reliability,
+)
+from normlift_ns.core.lift import lift, norm_of_reliability
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from tests.examples import examples
@@ -286,3 +293,14 @@ def test_refusals(unchecked):
     ):
         with pytest.raises(InputError, match=message):
             consensus(evidence, **{"features": features, **arguments})
+
+
+@given(SEEDS)
+@examples(5)
+def test_norm_before_the_consensus_follows_from_its_reliability(seed: int) -> None:
+    evidence, features = things(seed), unit_rows(20, 6, seed)
+    before = lift(evidence, features, beta=2.0).scalars
+    after = lift(evidence, consensus(evidence, features, least=0.0).features, beta=2.0).scalars
+    norm = norm_of_reliability(with_original_reliability(after, before), beta=2.0)
+    assert torch.allclose(norm, torch.where(after.norm > 0, before.norm, 0.0), atol=1e-12)
+    assert not torch.allclose(norm, after.norm, atol=1e-3)

@@ -52,7 +52,7 @@ def test_it_trains_as_splatfacto_does_and_the_demo_is_a_run_of_splatfacto(nerfst
     assert replace(demo, viewer=theirs.viewer) == theirs
 
 
-NOT_NEEDED = ["open_clip", "numba", "docstring_parser", "prompt_toolkit", "skimage", "transformers", "gsplat", "triton"]
+NOT_NEEDED = ["open_clip", "numba", "prompt_toolkit", "skimage", "transformers", "gsplat", "triton"]
 NOT_NEEDED += ["scipy", "torchmetrics"]
 
 
