@@ -94,7 +94,6 @@ def lift_scene(
         MemoryError: the lift does not fit into GPU memory.
     """
     collection = plan_collection(scene, source, options, cache, device=device, export=export)
-    collection.start_preparing_regions()
     kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
     return lift_collection(collection, kernels, device=device, encoder=encoder, report=report)
 
@@ -110,7 +109,7 @@ def lift_collection(
     """Run the steps of a planned lift.
 
     Args:
-        kernels: kernels from `start_kernel_warm_up`.
+        kernels: result of `start_kernel_warm_up`.
         device, encoder, report: as in `lift_scene`.
     Raises:
         ValueError, FileNotFoundError, MemoryError: as in `lift_scene`.
