@@ -177,7 +177,7 @@ def unoccluded_viewpoint(
 def viewpoint(
     target: ObjectRow | LookAtTarget, camera_position: Sequence[float] | np.ndarray, field_of_view: float = 0.9
 ) -> Position:
-    """Return a camera position on the current side of an object, at a distance at which the object fills the image.
+    """Return a camera position on the current side of an object, from which it fills 80 % of the image height.
 
     Args:
         target: Object or point to look at.
