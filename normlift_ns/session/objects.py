@@ -113,7 +113,7 @@ def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size
 Position = tuple[float, float, float]
 """x, y and z in scene units."""
 _MAX_OCCLUSION = 0.25
-"""Maximum mean opacity in front of the object for a clear view."""
+"""Largest mean opacity in front of an object at which the view of it counts as clear."""
 _FILL = 0.8
 """Fraction of the image height that an object fills if the camera faces it."""
 _SIGHT_POINTS = 8
