@@ -20,7 +20,7 @@ from torch import Tensor
 LEAF = 32
 SLOTS = 64
 SPARE = 4
-"""Number of candidates in addition to K, because float32 rounding can change the order of the last ones."""
+"""Number of candidates to keep in addition to the K nearest, because float32 rounding can change their order."""
 MAX_TREE_NEIGHBORS = SLOTS - SPARE
 _PAIRS = 2**24
 """Number of distances that `brute_force_nearest` computes at a time. Each takes 8 bytes, and 24 for its components."""

@@ -31,7 +31,7 @@ def _measure(
     logits, row_first, row_weights, column_first, column_weights, out, height, width, low_height, low_width, offset,
     ROWS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the pixel counts above offset and -offset, and the box x0, y0, x1, y1, of some rows to out[mask, part]."""
+    """Write the pixel counts above offset and -offset, and the box (x0, y0, x1, y1) of some rows to out[mask, part]."""
     mask = tl.program_id(0).to(tl.int64)
     mask_logits = logits + mask * low_height * low_width
     x = tl.arange(0, BLOCK)

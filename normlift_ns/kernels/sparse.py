@@ -68,7 +68,7 @@ def multiply_vector(
     weight: Float[Tensor, " nnz"],
     vector: Float[Tensor, " s"],
 ) -> Float[Tensor, " n"]:
-    """Return the product E x of a sparse matrix and a vector, in the precision of x but summed in float64.
+    """Return the product E x of a sparse matrix E and a vector x, in the precision of x but summed in float64.
 
     The kernel is fast for many short rows.
     """

@@ -124,7 +124,7 @@ def mask_evidence(
 
     Args:
         cameras: One camera per view.
-        masks: One mask per view and prompt; empty if the prompt was not found.
+        masks: Masks of the Q prompts in each view. A mask is False everywhere if the prompt was not found.
         valid_pixels: Mask of the pixels to use in each view; None for all pixels.
         options: `rasterize_mode` and `settings` of `rasterize_evidence`.
     Raises:

@@ -34,7 +34,7 @@ _CHOSEN = "texts_chosen"
 
 
 class DefaultRule(NamedTuple):
-    """Default relevancy rule of an encoder, with negatives and threshold. The threshold "auto" is the suggested one."""
+    """Default relevancy rule of an encoder, with negatives and threshold. "auto" means the suggested threshold."""
 
     rule: RelevancyRule
     negatives: tuple[str, ...]
@@ -46,7 +46,7 @@ _CONTRAST = DefaultRule("contrast", (), 0.5)
 
 
 class HasManifest(Protocol):
-    """Interface of a semantic field, of tensors or NumPy arrays, that has a manifest."""
+    """Interface of objects with a manifest, such as semantic fields of tensors or NumPy arrays."""
 
     @property
     def manifest(self) -> Mapping[str, Any]:

@@ -26,7 +26,7 @@ class PreparedGaussians(NamedTuple):
     """Drawable Gaussians of a scene with their covariances, for any camera."""
 
     gaussian: Int64[Tensor, " m"]
-    """Rows of the scene."""
+    """Indices of the Gaussians in the scene."""
     means: Float[Tensor, "m 3"]
     """Centers in the precision of the scene, because rounding would change the drawing order."""
     covariances: Float[Tensor, "m 3 3"]
@@ -37,7 +37,7 @@ class ProjectedGaussians(NamedTuple):
     """Visible Gaussians of one camera, nearest first."""
 
     gaussian: Int64[Tensor, " m"]
-    """Rows of the scene."""
+    """Indices of the Gaussians in the scene."""
     means2d: Float[Tensor, "m 2"]
     conics: Float[Tensor, "m 3"]
     """Entries xx, xy and yy of the inverse covariance, in 1 / pixels^2."""
@@ -58,7 +58,7 @@ class PreparedGaussians2D(NamedTuple):
     """The drawable Gaussians of a scene of 2D Gaussian Splatting, prepared for any camera."""
 
     gaussian: Int64[Tensor, " m"]
-    """Rows of the scene."""
+    """Indices of the Gaussians in the scene."""
     means: Float[Tensor, "m 3"]
     """Centers in the precision of the scene, because rounding would change the drawing order."""
     axes: Float64[Tensor, "m 3 2"]
@@ -70,7 +70,7 @@ class ProjectedGaussians2D(NamedTuple):
     """The Gaussians of 2D Gaussian Splatting visible in a camera, nearest first."""
 
     gaussian: Int64[Tensor, " m"]
-    """Rows of the scene."""
+    """Indices of the Gaussians in the scene."""
     means2d: Float[Tensor, "m 2"]
     """Centers of the projected ellipses of one standard deviation."""
     transforms: Float[Tensor, "m 3 3"]

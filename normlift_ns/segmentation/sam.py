@@ -235,7 +235,7 @@ class _Upscaling(NamedTuple):
     norm: _Norm
 
     def __call__(self, keys: Float[Tensor, "p n c"], mask_channels: Float[Tensor, "p m o"]) -> Float[Tensor, "p m y x"]:
-        """Return logits, the scalar products of the upscaled channels of every pixel with the channels of every mask."""
+        """Return logits, the scalar products of the upscaled channels of each pixel with the channels of each mask."""
         if can_use_triton(keys) and keys.dtype != torch.float32:
             from normlift_ns.kernels.sam import upscale_masks  # noqa: PLC0415 (needs Triton)
 
@@ -583,7 +583,7 @@ class _Candidates(NamedTuple):
     boxes: Int64[Tensor, "c 4"]
     """Boxes in the image, in the format of `masks_to_boxes`."""
     crop: Int64[Tensor, " c"]
-    """Index of the crop."""
+    """Index of the crop that the candidate was found in; 0 is the whole image."""
 
     def at(self, index: Tensor) -> _Candidates:
         return _Candidates(*(value[index] for value in self))

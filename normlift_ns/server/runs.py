@@ -161,7 +161,7 @@ class ServedRun:
 
     @cached_property
     def first_view(self) -> PageView | None:
-        """Camera of the first training image, looking at the median depth of the scene; None without images."""
+        """Camera of the first training image, with a target at the median depth of the scene; None without images."""
         cameras = self.run.scene.train.cameras
         if len(cameras) == 0:
             return None

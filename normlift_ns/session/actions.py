@@ -121,8 +121,8 @@ def ask(state: State, prompts: Sequence[Prompt], question: Query | None) -> Stat
     """Apply a new query. Hidden Gaussians stay hidden; clicked selections are dropped.
 
     Args:
-        prompts: All rows, from `build_query`.
-        question: Query of these rows, from `build_query`; None if no row has a vector, so that nothing is selected.
+        prompts: All prompts, from `build_query`.
+        question: Query of these prompts, from `build_query`; None if no prompt has a vector. Nothing is then selected.
     Raises:
         ValueError: The vectors have a different dimension than the field.
     """

@@ -113,7 +113,7 @@ def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size
 Position = tuple[float, float, float]
 """x, y and z in scene units."""
 _MAX_OCCLUSION = 0.25
-"""Maximum mean opacity in front of the object for a clear view."""
+"""Largest mean opacity in front of an object at which the view of it counts as clear."""
 _FILL = 0.8
 """Fraction of the image height that an object fills if the camera faces it."""
 _SIGHT_POINTS = 8
@@ -177,7 +177,7 @@ def unoccluded_viewpoint(
 def viewpoint(
     target: ObjectRow | LookAtTarget, camera_position: Sequence[float] | np.ndarray, field_of_view: float = 0.9
 ) -> Position:
-    """Return a camera position on the current side of an object, at a distance at which the object fills the image.
+    """Return a camera position on the current side of an object, from which it fills 80 % of the image height.
 
     Args:
         target: Object or point to look at.
