@@ -21,7 +21,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import cycle, permutations
+from itertools import cycle
 from pathlib import Path
 from urllib.request import urlopen
 
@@ -76,12 +76,10 @@ async def client(port: int, path: str, prompts: Iterator[str], log: Log, delay: 
 
 def questions() -> Iterator[str]:
     """In turns a known prompt and a new one, which names two colors."""
-    names = [*json.loads(XKCD.read_text())]
-    pairs = list(permutations(range(len(names)), 2))
-    random.Random(0).shuffle(pairs)
-    for known, (one, other) in zip(cycle(COLOURS), pairs):
+    names, choice = [*json.loads(XKCD.read_text())], random.Random(0)
+    for known in cycle(COLOURS):
         yield known
-        yield f"{names[one]} {names[other]}"
+        yield " ".join(choice.sample(names, 2))
 
 
 async def ask_all(server: ViewServer, run: str, log: Log) -> tuple[int, int]:

@@ -21,9 +21,6 @@ def _start(module: str, command: str) -> None:
 def _serve(module: str, command: str) -> None:
     # OpenMP threads that wait actively would take CPU time from other requests
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # a query releases the interpreter lock for every tensor operation, and waits this long to get it back from a thread
-    # that runs Python, such as one that imports a module; the default is 5 ms
-    sys.setswitchinterval(5e-4)
     _start(module, command)
 
 
