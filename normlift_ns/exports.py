@@ -453,7 +453,7 @@ class ExportJob:
     instances: Instances | None = None
     """Classes and objects of the answer; None without an answer."""
     objects: Mapping[str, Any] | None = None
-    """Table of these objects, with JSON types only."""
+    """Table of the objects in `instances`, with JSON types only."""
     rest: bool = False
     """True if `keep` is the rest of the scene, without the selection of the answer."""
     transfer: CloudTransfer | None = None

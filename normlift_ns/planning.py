@@ -440,7 +440,7 @@ def _version(name: str) -> str | None:
 
 
 def missing_weights(options: SourceOptions, device: str) -> list[str]:
-    """Return a description of all network weights that the options need and that are not on this machine."""
+    """Return descriptions of the network weights that the options need and that are not on this machine."""
     if options.features != "none":
         return []
     options, missing = resolve_source(options, device), []

@@ -54,9 +54,9 @@ class RegionVote:
     region: int
     """Index of the region within its image."""
     weight: float
-    """E_s, in pixels."""
+    """E_s, the weight of the selection in this region, in pixels."""
     share: float
-    """Fraction of the image's weight in this region, in 0..1."""
+    """Weight in this region as a fraction of the weight in the whole image, in 0..1."""
     agreement: float
     """Cosine of the region's feature to the direction of the selection."""
 
@@ -68,11 +68,11 @@ class ViewVote:
     view: int
     """Index of the image in the order of the lift."""
     weight: float
-    """W_v, in pixels."""
+    """W_v, the weight of the selection in this image, in pixels."""
     share: float
     """Weight of this image as a fraction of the weight of all images, in 0..1."""
     agreement: float
-    """a_v, in -1..1."""
+    """a_v, the cosine between the vote of this image and the sum of all votes."""
     disagreement: float
     """Fraction of the total disagreement that comes from this image, in 0..1; 0 if all images agree."""
     regions: tuple[RegionVote, ...]
@@ -152,7 +152,7 @@ _LEVELS = (
     (0.6, "agree partly"),
     (0.0, "contradict each other"),
 )
-"""Minimum C_inter of each description."""
+"""Pairs of a minimum C_inter and the words that describe this agreement of the images."""
 
 
 def explain_selection(
@@ -192,7 +192,10 @@ def explain_selection(
 
 
 def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: Tensor) -> float:
-    """Return the share of pairs of a Gaussian in `rows` and the one in `origin` whose directions differ."""
+    """Compare each Gaussian in `rows` with the one at the same position in `origin`.
+
+    Return the share of the pairs whose directions differ.
+    """
     step = -(-len(rows) // _COMPARED)
     rows, origin = rows[::step], origin[::step]
     other, table = rows != origin, torch.nn.functional.normalize(features.to(rows.device).float(), dim=1)

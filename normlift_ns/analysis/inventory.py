@@ -243,7 +243,7 @@ def _neighbor_borders(
 
 
 def _similarity(one: Tensor, other: Tensor, features: Tensor, spread: float) -> Float64[Tensor, " p"]:
-    """Return the count of each of P pairs of regions of one image; it is 1 if both are the same region."""
+    """Return the similarity of each of P pairs of regions in one image, in 0..1; 1 if both are the same region."""
     count = torch.ones(len(one), dtype=torch.float64)
     differs = (one != other).nonzero().squeeze(1)
     key, index = (one[differs] * len(features) + other[differs]).unique(return_inverse=True)

@@ -121,7 +121,7 @@ class SceneObject:
     """Summary of one object, in scene units. Means are weighted by W_j, the weight of Gaussian j over all views."""
 
     size: int
-    """Number of Gaussians."""
+    """Number of Gaussians of the object."""
     centroid: list[float]
     box: dict[str, list[float]]
     """Lowest corner "min" and highest corner "max" of the axis-aligned bounding box of the centers, as lists.
@@ -251,8 +251,8 @@ class Instances:
     selection, so further prompts do not change existing numbers.
     """
     classes: tuple[int, ...]
-    """Class of each object, starting with object 1. An object has no Gaussians if all of them belong to other
-    prompts."""
+    """Class of each object, starting with object 1. An object has no Gaussians if all Gaussians of its
+    component belong to other prompts."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the prompt of each class, and the class, prompt and size of each object, as plain Python types.
@@ -271,7 +271,7 @@ class Instances:
 
 
 def best_prompt(relevancy: Float[Tensor, "n q"], selected: Bool[Tensor, "n q"]) -> Int32[Tensor, " n"]:
-    """Return the index of the prompt with the largest relevancy among those that select the Gaussian; -1 if none does.
+    """Return, for every Gaussian, the index of the most relevant prompt among those that select it; -1 if none does.
 
     Ties go to the first prompt.
 
@@ -392,8 +392,8 @@ class CatalogueObject:
     views: int
     """Number of training images that show the object."""
     best_views: tuple[str, ...]
-    """Names of up to three images. Images of the whole object come first; among these, and among the others, larger
-    objects come first."""
+    """Names of up to three images. Images of the whole object come first. Within each group, images that show it larger
+    come first."""
     capture: Placement
     """Position and size in the coordinates of the capture."""
     scene: Placement

@@ -67,7 +67,7 @@ class Evidence(TensorRecord):
     rows: SparseRows
     """E, [N, S]. Every entry E_js is the sum of A_ij ** weight_power, > 0."""
     region_view: Int32[Tensor, " s"]
-    """View of every column, non-decreasing."""
+    """Index of the view of every column, in non-decreasing order."""
     unlabeled: SparseRows
     """Weight of Gaussian j in the unlabeled pixels of view v, [N, views]."""
     num_views: int
@@ -102,7 +102,7 @@ class Evidence(TensorRecord):
 
     @property
     def num_gaussians(self) -> int:
-        """N, including Gaussians without evidence."""
+        """N, the number of Gaussians, including those without evidence."""
         return len(self.rows)
 
     @property

@@ -29,7 +29,7 @@ from normlift_ns.core.lift import lift
 from normlift_ns.core.sparse import CHUNK_ELEMENTS, SparseRows, row_offsets
 
 PARTNER_IOU = 0.3
-"""J above which a kept region confirms a left-out region."""
+"""A kept region confirms a left-out region if J, their soft intersection over union, is above this value."""
 
 
 class LeftOut(NamedTuple):

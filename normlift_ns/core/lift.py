@@ -55,7 +55,7 @@ class Scalars(TensorRecord):
     """
 
     norm: Float[Tensor, " n"]
-    """||f_j||, in 0..1."""
+    """||f_j||, the length of the weighted mean of the features, in 0..1."""
     c_intra: Float[Tensor, " n"]
     """Agreement within views, in 0..1."""
     c_inter: Float[Tensor, " n"]
@@ -63,9 +63,9 @@ class Scalars(TensorRecord):
     n_eff: Float[Tensor, " n"]
     """Effective number of views, in 1..view_count, or 0 without evidence."""
     reliability: Float[Tensor, " n"]
-    """R_j, in 0..1."""
+    """Reliability R_j, in 0..1."""
     weight: Float[Tensor, " n"]
-    """W_j, the denominator of f_j."""
+    """W_j, the sum of the Gaussian's weights over all views, by which the sum of its features is divided."""
     view_count: Int32[Tensor, " n"]
     """Number of views in which the Gaussian has weight."""
 

@@ -14,7 +14,7 @@ from normlift_ns.io.guard import read_text
 from normlift_ns.options import Primitive, RasterizeMode
 
 _NAMES = ("cfg.yml", "cfg.json")
-"""Names of the file. simple_trainer_2dgs.py writes a .json file, which is also valid YAML."""
+"""Possible names of the settings file. simple_trainer_2dgs.py writes a .json file, which is also valid YAML."""
 _MAX_BYTES = 2**18
 _FOLDERS = ("ckpts", "ply")
 _OF_3DGUT = ("with_ut", "with_eval3d")

@@ -445,7 +445,7 @@ def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path:
 
 
 def _focal(focal: float | None, angle: float | None, side: float) -> float | None:
-    """Return the focal length in pixels, computed from the angle of view in radians if it is None."""
+    """Return the focal length in pixels. If `focal` is None, compute it from the angle of view in radians."""
     return 0.5 * side / math.tan(0.5 * angle) if focal is None and angle is not None else focal
 
 

@@ -60,7 +60,8 @@ class _Points(NamedTuple):
     views: list[View]
 
     def agreement(self, worlds: Sequence[_Motion]) -> Float[Tensor, " w"]:
-        """Return the mean correlation in -1..1 of the images with the visible points, for cameras in other worlds."""
+        """Return the mean correlation in -1..1 of the images with the visible points, for cameras in each of the
+        worlds."""
         values = torch.zeros(len(worlds))
         for view in self.views:
             poses = torch.stack([world.move(view.camera.world_to_camera) for world in worlds])
@@ -94,7 +95,7 @@ class _Points(NamedTuple):
 
 
 def _centered(image: Float[Tensor, "b c h w"], used: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "b c h w"]:
-    """Return the difference from the mean color of the pixels with weight 1; 0 at those with weight 0."""
+    """Subtract the mean color of the pixels with weight 1 from an image, and set the pixels with weight 0 to 0."""
     return (image - (image * used).sum(dim=(2, 3), keepdim=True) / used.sum().clamp(min=1)) * used
 
 
@@ -218,7 +219,7 @@ def _rounded(scale: float) -> float:
 
 
 def _likely(agreement: Float[Tensor, " w"]) -> list[int]:
-    """Return the indices of the worlds that agree nearly as well as the best one, which is first."""
+    """Return the indices of the worlds that agree nearly as well as the best world, starting with the best."""
     values, order = agreement.sort(descending=True)
     return order[values >= _LIKELY * values[0].clamp(min=1e-6)][:_MAX_LIKELY].tolist()
 

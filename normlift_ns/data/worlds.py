@@ -36,7 +36,7 @@ _TURNS = {
     "a quarter turn about x, from z up to y up": _Y_DOWN_TO_Z_UP,
     "an exchange of x and y with z reversed": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
 }
-"""Rotations between the axes of tools. Old versions of ns-process-data applied the last one."""
+"""Rotations between the axis conventions of tools. Old versions of ns-process-data applied the last one."""
 _OPENCV_AXES = np.array([1.0, -1, -1, 1])
 
 

@@ -42,7 +42,7 @@ from normlift_ns.options import MissingFeatures
 from normlift_ns.segmentation.regions import resample_nearest
 
 LANGSPLAT_LEVELS = ("default", "s", "m", "l")
-"""Channels of a segment map."""
+"""Names of the channels of a segment map, in order."""
 _MAX_EXACT_HALF = 2048
 """Largest integer up to which half precision represents all integers exactly."""
 _MIN_LENGTH = 1e-30

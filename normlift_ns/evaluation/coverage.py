@@ -135,9 +135,9 @@ class WeakRegion:
     """Connected visible Gaussians with little reliable evidence. Means are weighted by surface."""
 
     size: int
-    """Number of Gaussians."""
+    """Number of Gaussians in the region."""
     centre: list[float]
-    """Center in scene units."""
+    """Center of the region as x, y and z, in scene units."""
     box: dict[str, list[float]]
     """Corners "min" and "max" of the bounding box of the centers, in scene units."""
     share: float

@@ -23,7 +23,7 @@ class PublishedTable:
     columns: Mapping[str, Numbers]
     """Numbers of each method. The last method is NormLift."""
     factor: float = 1.0
-    """Factor from the numbers of an evaluation to those of the table, such as 100 for percent."""
+    """Factor that converts numbers of an evaluation to the unit of the table, such as 100 for percent."""
 
 
 def _numbers(metrics: Sequence[str], rows: Mapping[str, Sequence[float]]) -> Numbers:
