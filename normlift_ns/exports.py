@@ -165,17 +165,17 @@ def write_splat(
     reliabilities, relevancies and labels; the other formats have no columns for them.
 
     Args:
-        path: path of the file.
-        splat: the Gaussians. The file records the rasterization mode only if it is "antialiased", because other tools
+        path: Path of the file.
+        splat: The Gaussians. The file records the rasterization mode only if it is "antialiased", because other tools
             assume "classic" by default.
-        keep: mask of the Gaussians to write. Those that `exportable_rows` leaves out are skipped.
-        file_format: format of the file. If None, the ending of the file name selects it; see `_FORMATS`.
-        overwrite: replace existing files.
+        keep: Mask of the Gaussians to write. Those that `exportable_rows` leaves out are skipped.
+        file_format: Format of the file. If None, the ending of the file name selects it; see `_FORMATS`.
+        overwrite: Replace existing files.
     Raises:
-        FileExistsError: a file exists, and `overwrite` is False.
-        ValueError: no Gaussian is left to write, `labels.objects` cannot be encoded as JSON, or a Gaussian is too far
+        FileExistsError: A file exists, and `overwrite` is False.
+        ValueError: No Gaussian is left to write, `labels.objects` cannot be encoded as JSON, or a Gaussian is too far
             from the origin for SPZ.
-        OSError: a file cannot be written, for instance because the disk is full.
+        OSError: A file cannot be written, for instance because the disk is full.
     """
     columns = splat.columns()
     rows = exportable_rows(columns, keep)
@@ -288,8 +288,8 @@ def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
     These files number classes and objects from 0, as class_id - 1 and instance_id - 1. Evaluations ignore -1.
 
     Raises:
-        FileExistsError: a file exists, and `overwrite` of the job is False.
-        OSError: a file cannot be written.
+        FileExistsError: A file exists, and `overwrite` of the job is False.
+        OSError: A file cannot be written.
     """
     instances, files = job.instances, tuple(folder / name for name in LABEL_ARRAY_FILES)
     assert instances is not None
@@ -333,8 +333,8 @@ def nearest_gaussians(
     """Find the Gaussian center that is nearest to each point, with a k-d tree.
 
     Args:
-        means: centers of at least one Gaussian.
-        max_distance: maximum distance, inclusive.
+        means: Centers of at least one Gaussian.
+        max_distance: Maximum distance, inclusive.
     Returns:
         The row of the nearest center for each point, and True if it is within the maximum distance.
 
@@ -353,8 +353,8 @@ def read_cloud(path: Path) -> PlyData:
     """Read a PLY file whose vertices have x, y and z.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is truncated or not a PLY file, or its vertices have no positions.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is truncated or not a PLY file, or its vertices have no positions.
     """
     expected = "Expected a point cloud or mesh in PLY format whose vertices have x, y and z."
     if not path.is_file():
@@ -393,12 +393,12 @@ def label_cloud(
     """Write a cloud with the labels of the nearest Gaussians; points that are too far from all Gaussians get zeros.
 
     Args:
-        path: path of the new PLY file.
-        means: centers [M, 3] of the Gaussians to take labels from, in the coordinates of the scene, float64.
-        columns: labels of these Gaussians, by property name.
+        path: Path of the new PLY file.
+        means: Centers [M, 3] of the Gaussians to take labels from, in the coordinates of the scene, float64.
+        columns: Labels of these Gaussians, by property name.
     Raises:
         ValueError: `means` is empty or all Gaussians are at one position; also as in `write_cloud`.
-        FileExistsError, OSError: as in `write_cloud`.
+        FileExistsError, OSError: As in `write_cloud`.
     """
     if len(means) == 0:
         raise InputError(
@@ -422,9 +422,9 @@ def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, o
     """Write a cloud with additional vertex properties after the existing ones, and with all other content unchanged.
 
     Raises:
-        ValueError: the vertices already have a property of one of these names.
-        FileExistsError: the file exists, and `overwrite` is False.
-        OSError: the file cannot be written.
+        ValueError: The vertices already have a property of one of these names.
+        FileExistsError: The file exists, and `overwrite` is False.
+        OSError: The file cannot be written.
     """
     check_no_properties(cloud, columns)
     vertex = cloud["vertex"].data

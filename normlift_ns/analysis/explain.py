@@ -167,12 +167,12 @@ def explain_selection(
     """Explain a selection by the votes of the images.
 
     Args:
-        features: one unit row per column (region) of the evidence.
+        features: One unit row per column (region) of the evidence.
         selected: True for the selected Gaussians.
-        source: index of the Gaussian whose direction each Gaussian uses, from `refine`; None if each uses its own.
-        beta, unlabeled: as in `lift`.
+        source: Index of the Gaussian whose direction each Gaussian uses, from `refine`; None if each uses its own.
+        beta, unlabeled: As in `lift`.
     Raises:
-        ValueError: nothing is selected, or the numbers of Gaussians or regions differ.
+        ValueError: Nothing is selected, or the numbers of Gaussians or regions differ.
     """
     n = evidence.num_gaussians
     if selected.dtype != torch.bool or selected.shape != (n,):
@@ -312,7 +312,7 @@ class RecordedVotes:
         """Names of the images in the order of the lift.
 
         Raises:
-            ValueError: the run does not record the names or has evidence of a different number of images, or the
+            ValueError: The run does not record the names or has evidence of a different number of images, or the
                 dataset no longer has all images.
         """
         names = self.field.manifest.get("views_lifted")
@@ -339,9 +339,9 @@ class RecordedVotes:
         """Explain a selection by the votes of the images; see `explain_selection`.
 
         Args:
-            refined: for a Gaussian that took over the direction of a neighbor, use the evidence of that neighbor.
+            refined: For a Gaussian that took over the direction of a neighbor, use the evidence of that neighbor.
         Raises:
-            ValueError: nothing is selected, or the votes are no longer in the cache.
+            ValueError: Nothing is selected, or the votes are no longer in the cache.
         """
         evidence, features = self.table
         source = self.field.source if refined else None
@@ -352,8 +352,8 @@ class RecordedVotes:
         """Yield the images one after another, with outlines of the regions that voted.
 
         Raises:
-            FileNotFoundError: an image no longer exists.
-            ValueError: an image has changed, or its regions are no longer in the cache. The regions of features passed
+            FileNotFoundError: An image no longer exists.
+            ValueError: An image has changed, or its regions are no longer in the cache. The regions of features passed
                 from Python are never in the cache.
         """
         for vote in votes:
@@ -369,7 +369,7 @@ class RecordedVotes:
         """Evidence of all images, and the feature of every region.
 
         Raises:
-            ValueError: the votes are no longer in the cache.
+            ValueError: The votes are no longer in the cache.
         """
         store = self.field.store
         if isinstance(store, StoredEvidence):

@@ -227,7 +227,8 @@ def make_shard(word: str, environment: Mapping[str, str]) -> Shard:
     In a Slurm array whose tasks have several ranks (RANK, WORLD_SIZE), each rank of each task has its own part.
 
     Args:
-        word: auto for the part that the environment defines, none for the whole list, or i/n for the i-th of n parts.
+        word: Value of --shard: auto for the part that the environment defines, none for the whole list, or i/n for the
+            i-th of n parts.
         environment: Environment variables.
     Raises:
         InputError: The word is invalid, variables contradict each other, or a Slurm array has gaps.

@@ -44,7 +44,7 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
     """Join the other processes of the lift. Only the first process prints.
 
     Args:
-        device: cpu, cuda or auto.
+        device: Device to lift on: cpu, cuda or auto.
     Yields:
         The communicator, or None if there is only one process.
     """

@@ -64,11 +64,11 @@ def leave_views_out(
     The formulas are in the module docstring.
 
     Args:
-        sampled: evidence of the Gaussians from `sample_gaussians`.
-        probability: sampling probability of each row.
+        sampled: Evidence of the Gaussians from `sample_gaussians`.
+        probability: Sampling probability of each row.
         features: F, before the consensus; unit rows or 0.
-        level: level of every region (default: the same for all). Regions of different levels are not compared.
-        power, least: options of the consensus, as in `consensus`. If `least` is None, lift the kept views without a
+        level: Level of every region (default: the same for all). Regions of different levels are not compared.
+        power, least: Options of the consensus, as in `consensus`. If `least` is None, lift the kept views without a
             consensus.
     """
     device = sampled.rows.weight.device

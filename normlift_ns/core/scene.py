@@ -76,7 +76,7 @@ class Views(Protocol):
         """Read one image.
 
         Raises:
-            FileNotFoundError, ValueError: if the file is missing or cannot be read. The message names the file.
+            FileNotFoundError, ValueError: If the file is missing or cannot be read. The message names the file.
         """
         ...
 

@@ -55,7 +55,7 @@ def measure_alignment(
 
     Args:
         scene: Gaussians, cameras and images.
-        settings: constants of the rasterizer at the original image size. None: the constants that the scene records.
+        settings: Constants of the rasterizer at the original image size. None: the constants that the scene records.
         device: torch device to render on.
         explain: True to look for a better lens or primitive in any case. False to skip this search if the PSNR or the
             margin is below the usual minimum.

@@ -121,8 +121,8 @@ class _Search:
     """Comparison of candidate worlds with the images of a scene.
 
     Args:
-        scene: the scene in one of the worlds.
-        here: the world of `scene`.
+        scene: The scene in one of the worlds.
+        here: The world of `scene`.
         device: torch device to render on.
     """
 
@@ -284,10 +284,10 @@ def find_world(
     fits, or in the first world if none or several fit.
 
     Args:
-        candidates: possible worlds.
-        scene_in: function that returns the scene in a world.
+        candidates: Possible worlds.
+        scene_in: Function that returns the scene in a world.
         device: torch device to render on.
-        say: function that is called with a sentence if another world fits.
+        say: Function that is called with a sentence if another world fits.
     """
     here = candidates[0]
     scene = scene_in(here)

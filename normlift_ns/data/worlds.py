@@ -91,7 +91,7 @@ def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile
     OpenCV's axes.
 
     Raises:
-        FileNotFoundError, ValueError: if the world that the options state cannot be read or computed.
+        FileNotFoundError, ValueError: If the world that the options state cannot be read or computed.
     """
     if isinstance(options.world_transform, Path):
         world = read_world_transform(options.world_transform, cameras.applied_transform, cameras.applied_scale)

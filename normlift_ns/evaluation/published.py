@@ -148,9 +148,9 @@ def compare_with_paper(
     """Return the paper's tables that the evaluation can be compared with, and its results in the column `yours`.
 
     Args:
-        evaluation: result of --protocol scannet or lerf. Studies belong to the data set of the paper: ablation and
+        evaluation: Result of --protocol scannet or lerf. Studies belong to the data set of the paper: ablation and
             signals to scannet, timing to lerf.
-        studies: rows of each study, by its name.
+        studies: Rows of each study, by its name.
     Returns:
         Rows by title of the table. `yours` is NaN if the evaluation lacks the scene or the variant, and `difference` is
         `yours` minus the number of NormLift.
