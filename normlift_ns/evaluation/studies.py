@@ -334,7 +334,7 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
 
 
 def _correct_predictions(scenes: Sequence[SceneSignals]) -> tuple[Bool[Tensor, " n"], dict[str, Bool[Tensor, " n"]]]:
-    """Return a mask of the Gaussians with ground truth, and a mask of correct predictions for each kind."""
+    """Return a mask of the Gaussians with ground truth, and a mask of correct ones for each kind of prediction."""
     truths = [scene.truth for scene in scenes if scene.truth is not None]
     if len(truths) < len(scenes):
         return torch.zeros(0, dtype=torch.bool), {}
@@ -473,7 +473,7 @@ def study_votes(
 def study_ablation(
     runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str, warn: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
-    """Evaluate the protocol with every variant, both with and without consensus.
+    """Evaluate the protocol with every variant without consensus, and with `CONSENSUS_VARIANTS` after a consensus.
 
     Args:
         warn: Callback with the reason if variants are skipped, because the features of a run are not available.
