@@ -144,7 +144,10 @@ def _partners(found: Overlaps, kept: Bool[Tensor, " s"], features: Float[Tensor,
 def _nearest_is_own(
     rows: Float[Tensor, "c d"], features: Float[Tensor, "c d"], group: Int64[Tensor, " c"]
 ) -> Bool[Tensor, " c"]:
-    """Return True for each nonzero row that is nearer to its own feature than to the other features of its group."""
+    """Return True for each nonzero row that is nearer to its own feature than to the other features of its group.
+
+    The result is False for the only row of a group.
+    """
     found = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     for one in group.unique().tolist():
         members = (group == one).nonzero().squeeze(1)

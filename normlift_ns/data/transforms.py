@@ -370,7 +370,10 @@ def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrins
 def _readings(
     entry: CameraEntry, start: str, names: Sequence[str], lens: Intrinsics
 ) -> Iterator[tuple[str, str, float]]:
-    """Yield the name, key in the file and value of each given parameter, with angles converted to pixels."""
+    """Yield the name, key in the file and value of each given parameter.
+
+    Angles of view are converted to focal lengths in pixels.
+    """
     for name, value in _given(entry, *names):
         if name.startswith("camera_angle"):
             if 0 < value < math.pi:

@@ -203,7 +203,7 @@ def variant_votes(variants: Mapping[str, Variant], owns: Sequence[Vote]) -> Iter
 def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
     """Yield the votes of `SWEEPS` around the values of each run, one vote per run.
 
-    Labels mark the default and the values of the runs, which are included.
+    The default and the values of the runs are included, and labels mark them.
     """
     for parameter, values in SWEEPS.items():
         default = default_value(parameter, owns[0].config.vote)
