@@ -62,7 +62,7 @@ class OrientedBox:
         return self.center + (signs * self.size) @ self.axes
 
     def transformed(self, by: SimilarityTransform) -> OrientedBox:
-        """Return the transformed box."""
+        """Return the box after a similarity transform."""
         center = torch.from_numpy(by.transform_points(self.center.numpy()[None])[0])
         return OrientedBox(center, by.scale * self.size, self.axes @ torch.from_numpy(by.rotation).T)
 

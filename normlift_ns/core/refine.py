@@ -316,7 +316,7 @@ def _decay(r: Tensor, square: Tensor) -> Tensor:
 def _margin(
     neighbors: Neighbors, width: Tensor, rows: Int[Tensor, " m"], reliability: Tensor, delta: float
 ) -> Float64[Tensor, " m"] | float:
-    """Return Delta times the factor of `voting_weights`, or infinity if no member is reliable."""
+    """Return Delta times the factor of `voting_weights`. If Delta > 0, it is infinite if no member is reliable."""
     if delta == 0:
         return 0.0
     return delta * torch.exp(0.5 * _nearest(*_within(neighbors, width, rows, reliability)).squeeze(1))

@@ -84,7 +84,7 @@ def measure_alignment(
 def _compare(
     gaussians: GaussianScene, views: Sequence[ReducedView], renders: Sequence[UInt8[Tensor, "h w 3"]]
 ) -> Alignment:
-    """Return the agreement of views with their renders, without its causes."""
+    """Return the agreement of views with their renders, without a `cause`."""
     visible = max(float(in_frustum(gaussians.means, small.view.camera).float().mean()) for small in views)
     psnrs = {small.view.name: small.psnr(image) for small, image in zip(views, renders)}
     worst = min(psnrs, key=lambda name: psnrs[name])

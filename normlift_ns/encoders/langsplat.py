@@ -210,7 +210,7 @@ class LangSplat:
 
     @cached_property
     def folder(self) -> Path:
-        """Folder that contains the files."""
+        """Folder that contains the files of the images: `root`, or a folder inside it."""
         folders = [self.root, self.root / _NESTED, self.root / _NESTED / _NESTED]
         for folder in folders:
             if os.path.isdir(folder) and next(folder.glob("*_s.npy"), None) is not None:

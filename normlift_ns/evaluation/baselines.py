@@ -250,7 +250,7 @@ def iter_medians(
 
 
 def _visible(row: Tensor, view: Tensor, weight: Tensor, count: int, views: int) -> Bool[Tensor, " nnz"]:
-    """Select the entries of views with at least `VISIBLE` times the largest weight of the Gaussian in a view."""
+    """Select the entries of views in which a Gaussian has at least `VISIBLE` times its largest weight in any view."""
     keys, group = (row * views + view).unique(return_inverse=True)
     view_weight = weight.new_zeros(len(keys)).index_add_(0, group, weight)
     heaviest = weight.new_zeros(count).scatter_reduce_(0, keys // views, view_weight, "amax")
