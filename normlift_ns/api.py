@@ -215,11 +215,10 @@ def run_lift(request: LiftRequest) -> LiftedRun:
     check_target(prepared)
     announce(prepared)
     collection = plan_collection(scene, prepared.source, prepared.lift, cache, device=device, export=request.export)
-    wait_for_kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
-    check_alignment(prepared, stages)  # while the kernels are compiled
-    result = lift_collection(
-        collection, wait_for_kernels, device=device, encoder=prepared.encoder, report=request.report
-    )
+    collection.start_preparing_regions()
+    kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
+    check_alignment(prepared, stages, kernels.wait_for_rendering)  # while the other kernels are compiled
+    result = lift_collection(collection, kernels, device=device, encoder=prepared.encoder, report=request.report)
     return write_lifted_run(prepared, result, stages)
 
 
@@ -283,11 +282,16 @@ def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str 
     return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
 
 
-def check_alignment(prepared: PreparedLift, stages: StageTimer) -> None:
-    """Report the warning of `compare_with_images`, unless the request disables the comparison."""
+def check_alignment(prepared: PreparedLift, stages: StageTimer, wait_for_rendering: Callable[[], None]) -> None:
+    """Report the warning of `compare_with_images`, unless the request disables the comparison.
+
+    Args:
+        wait_for_rendering: Function that waits for the kernels of renders.
+    """
     if not prepared.request.check_alignment:
         return
     with stages("check") as step:
+        wait_for_rendering()
         warning = compare_with_images(prepared.scene, prepared.lift, prepared.device)
         step()
     if warning is not None:

@@ -12,7 +12,8 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from threading import Thread
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float, Int32, Int64
@@ -104,6 +105,16 @@ class ViewObservations(NamedTuple):
         return ViewObservations(Evidence.merge(*evidence), torch.cat(features), torch.cat(level))
 
 
+class Kernels(Protocol):
+    """Kernels that are compiled in the background; see `pipeline.KernelWarmUp`."""
+
+    def start_lift(self, dimension: int) -> None: ...  # noqa: D102
+
+    def wait_for_evidence(self) -> None: ...  # noqa: D102
+
+    def wait(self) -> None: ...  # noqa: D102
+
+
 @dataclass(frozen=True)
 class EvidenceCollection:
     """Collection of evidence from some training views, one chunk of views at a time.
@@ -131,21 +142,33 @@ class EvidenceCollection:
         source = cached(self.source, self.cache) if self.options.reuse_evidence else self.source
         return downscaled_source(source, self.options.lift_downscale)
 
-    def collect(self, stages: StageTimer, wait_for_kernels: Callable[[], None]) -> ViewObservations:
+    def start_preparing_regions(self) -> None:
+        """Load what segments images in the background. Errors are suppressed, because the first image raises them."""
+        prepare = getattr(getattr(self._cached_source, "regions", None), "prepare", None)
+
+        if prepare is None:
+            return
+
+        def work() -> None:
+            with suppress(Exception):
+                prepare()
+
+        Thread(target=work, name="prepare regions", daemon=True).start()
+
+    def collect(self, stages: StageTimer, kernels: Kernels) -> ViewObservations:
         """Collect evidence, features and levels from all views.
 
         Args:
             stages: Timer of the lift, which reports progress.
-            wait_for_kernels: Function that waits until the kernels are compiled.
+            kernels: Kernels that are compiled meanwhile.
         """
-        parts = [self.collect_chunk(chunk, stages, wait_for_kernels) for chunk in chunk_views(self.views)]
+        parts = [self.collect_chunk(chunk, stages, kernels) for chunk in chunk_views(self.views)]
         with stages("evidence", len(self.views)):
             views = ViewObservations.merge(parts)
+            kernels.wait()
         return views._replace(features=views.features.to(self.gaussians.means.device, self.config.dtype))
 
-    def collect_chunk(
-        self, chunk: Sequence[int], stages: StageTimer, wait_for_kernels: Callable[[], None]
-    ) -> ViewObservations:
+    def collect_chunk(self, chunk: Sequence[int], stages: StageTimer, kernels: Kernels) -> ViewObservations:
         """Collect evidence, features and levels from one chunk of the views; see `collect`."""
         source = self._cached_source
         rendered = self.config.settings if self.options.image_source == "render" else None
@@ -158,8 +181,9 @@ class EvidenceCollection:
 
             divisor = self.options.lift_downscale
             block = observe_views(self.scene, chunk, source, render_settings=rendered, downscale=divisor, on_view=done)
+        kernels.start_lift(block.features[0].shape[1])
         with stages("evidence", len(self.views)) as step:
-            wait_for_kernels()
+            kernels.wait_for_evidence()
             reuse, folder = self.options.reuse_evidence, self.cache / "evidence"
             evidence = batch_evidence(self.gaussians, block, folder, self.config, reuse=reuse, on_view=step)
         return ViewObservations.of_block(block, evidence)

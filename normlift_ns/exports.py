@@ -234,7 +234,7 @@ def _to_ply(
 def _encode(
     name: str, kind: SplatFormat, splat: TrainedSplat, labels: SplatLabels, rows: Int64[np.ndarray, " m"]
 ) -> tuple[bytes, Int64[np.ndarray, " m"] | slice, tuple[str, ...]]:
-    """Return the bytes of a file, the order of its rows, and messages about rounding errors."""
+    """Return the bytes of a file, the order in which it contains `rows`, and messages about rounding errors."""
     values = {key: value[torch.from_numpy(rows)] for key, value in splat.with_harmonics().parameters.items()}
     visible = SplatParameters(**values)
     if kind == "compressed_ply":
@@ -308,11 +308,11 @@ def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
 
 
 class CloudTransfer(NamedTuple):
-    """Point cloud to label, with the distance limit and the transform into its coordinates."""
+    """Point cloud to label, with a limit on distances and a transform into the coordinates of the cloud."""
 
     cloud: PlyData
     max_distance: float
-    """Maximum distance from a point to its Gaussian, in units of the median spacing of the Gaussians."""
+    """Maximum distance from a point to the nearest Gaussian center, in units of the median spacing of the centers."""
     to_cloud: SimilarityTransform | None
     """Transform from the coordinates of the Gaussians to those of the cloud; None if they are the same."""
 
@@ -322,9 +322,9 @@ class LabelTransfer(NamedTuple):
 
     points: int
     share: float
-    """Fraction of points with a Gaussian within `limit`, in 0..1."""
+    """Fraction of points that are at most `limit` away from the nearest Gaussian center, in 0..1."""
     limit: float
-    """Maximum distance from a point to its Gaussian, in the coordinates of the cloud."""
+    """Maximum distance from a point to the nearest Gaussian center, in the coordinates of the cloud."""
 
 
 def nearest_gaussians(
@@ -336,7 +336,7 @@ def nearest_gaussians(
         means: Centers of at least one Gaussian.
         max_distance: Maximum distance, inclusive.
     Returns:
-        The row of the nearest center for each point, and True if it is within the maximum distance.
+        The row of the nearest center for each point, and True for each point whose nearest center is near enough.
 
     >>> nearest_gaussians(np.array([[0.0, 0, 1], [0, 0, 9]]), np.array([[0.0, 0, 3], [0, 0, 0]]), max_distance=2.0)
     (array([1, 0]), array([ True, False]))
@@ -453,14 +453,14 @@ class ExportJob:
     instances: Instances | None = None
     """Classes and objects of the answer; None without an answer."""
     objects: Mapping[str, Any] | None = None
-    """Table of the objects in `instances`, with JSON types only."""
+    """Table of the objects of the answer, with JSON types only."""
     rest: bool = False
     """True if `keep` is the rest of the scene, without the selection of the answer."""
     transfer: CloudTransfer | None = None
     overwrite: bool = False
     """Replace existing files."""
     to_capture: SimilarityTransform | None = None
-    """Transform to the coordinates of the files; None for those of the scene."""
+    """Transform from the coordinates of the scene to those of the files; None if they are the same."""
 
     @property
     def splat(self) -> TrainedSplat:

@@ -8,7 +8,7 @@ in several processes.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -30,16 +30,17 @@ from normlift_ns.core.consensus import (
     sample_gaussians,
     with_original_reliability,
 )
+from normlift_ns.core.device import load_triton
 from normlift_ns.core.evidence import Entries, Evidence
-from normlift_ns.core.field import SemanticField
+from normlift_ns.core.field import CHANGED_COSINE, SemanticField
 from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
-from normlift_ns.core.gaussians import Camera, GaussianScene
+from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.independence import independent_views, pair_reliability
 from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import Lifted, lift, norm_of_reliability
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.null_level import with_null_level
-from normlift_ns.core.refine import CHANGED_COSINE, clamp_k, labeled_share, refine, unsupported
+from normlift_ns.core.refine import clamp_k, labeled_share, refine, unsupported
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
@@ -49,7 +50,7 @@ from normlift_ns.evidence_collection import EvidenceCollection, RasterConfig, Vi
 from normlift_ns.options import LiftOptions
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
-from normlift_ns.rasterization.rasterize import rasterize_evidence, resolve_backend
+from normlift_ns.rasterization.rasterize import resolve_backend
 
 _MIN_LIFTED_SHARE = 0.01
 """Smallest share of Gaussians with a direction, in 0..1, for which `check_directions` does not warn."""
@@ -57,7 +58,7 @@ _OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
 """Kinds of regions that are objects or parts of objects."""
 _COMPARED = 20_000
 """Approximate number of Gaussians whose directions are compared before and after the vote."""
-_WARM_UP_GAUSSIANS, _WARM_UP_REGIONS, _WARM_UP_DIMENSION = 4096, 4, 512
+_WARM_UP_GAUSSIANS, _WARM_UP_REGIONS = 4096, 4
 
 
 class LiftResult(NamedTuple):
@@ -93,13 +94,13 @@ def lift_scene(
         MemoryError: The lift does not fit into GPU memory.
     """
     collection = plan_collection(scene, source, options, cache, device=device, export=export)
-    wait_for_kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
-    return lift_collection(collection, wait_for_kernels, device=device, encoder=encoder, report=report)
+    kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
+    return lift_collection(collection, kernels, device=device, encoder=encoder, report=report)
 
 
 def lift_collection(
     collection: EvidenceCollection,
-    wait_for_kernels: Callable[[], None],
+    kernels: KernelWarmUp,
     *,
     device: str,
     encoder: Mapping[str, Any],
@@ -108,14 +109,14 @@ def lift_collection(
     """Run the steps of a planned lift.
 
     Args:
-        wait_for_kernels: Function from `start_kernel_warm_up`.
+        kernels: Result of `start_kernel_warm_up`.
         device, encoder, report: As in `lift_scene`.
     Raises:
         ValueError, FileNotFoundError, MemoryError: As in `lift_scene`.
     """
     stages, facts = StageTimer(report), {}
     options, means, source = collection.options, collection.gaussians.means, collection.source
-    views = collection.collect(stages, wait_for_kernels)
+    views = collection.collect(stages, kernels)
     table = views.features
     if options.consensus:
         with stages("consensus") as step:
@@ -477,61 +478,115 @@ def with_cost(field: SemanticField, stages: StageTimer, device: str) -> Semantic
     return replace(field, manifest={**field.manifest, "cost": lift_cost(stages.seconds, device)})
 
 
+class KernelWarmUp:
+    """Threads that compile or load the kernels of a lift before their first use.
+
+    Errors in the threads are suppressed, because the lift itself raises them again.
+
+    Args:
+        rendering: Calls that compile the kernels of renders.
+        early: Calls that compile the other kernels that do not depend on the features.
+        lift: Calls that compile the remaining kernels, as a function of the dimension of the features.
+        load: Function that each thread calls first.
+    """
+
+    def __init__(
+        self,
+        rendering: Iterable[Callable[[], None]] = (),
+        early: Iterable[Callable[[], None]] = (),
+        lift: Callable[[int], Iterable[Callable[[], None]]] = lambda dimension: (),
+        load: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._lift_calls, self._load, self._lift = lift, load, list[Thread]()
+        self._rendering, self._early = ([self._start(call) for call in calls] for calls in (rendering, early))
+
+    def _start(self, call: Callable[[], None]) -> Thread:
+        def run() -> None:
+            with suppress(Exception), torch.no_grad():
+                self._load()
+                call()
+
+        thread = Thread(target=run, name="kernel warm-up", daemon=True)
+        thread.start()
+        return thread
+
+    def start_lift(self, dimension: int) -> None:
+        """Start to compile the kernels that depend on the dimension of the features, unless this has been done."""
+        if len(self._lift) == 0:
+            self._lift = [self._start(call) for call in self._lift_calls(dimension)]
+
+    def wait_for_rendering(self) -> None:
+        """Wait for the kernels of renders."""
+        for thread in self._rendering:
+            thread.join()
+
+    def wait_for_evidence(self) -> None:
+        """Wait for all kernels that do not depend on the features."""
+        for thread in (*self._rendering, *self._early):
+            thread.join()
+
+    def wait(self) -> None:
+        """Wait for all kernels whose compilation has been started."""
+        for thread in (*self._rendering, *self._early, *self._lift):
+            thread.join()
+
+
 def start_kernel_warm_up(
     scene: Scene, gaussians: GaussianScene, options: LiftOptions, config: RasterConfig
-) -> Callable[[], None]:
-    """Start to compile or load kernels in the background, and return a function that waits for them."""
+) -> KernelWarmUp:
+    """Start to compile or load the kernels of a lift in the background."""
     if config.backend == "numba":
         from normlift_ns.rasterization.numba import compile_kernels  # noqa: PLC0415 (importing numba takes a second)
 
-        return compile_kernels(config.dtype).join
+        return KernelWarmUp(early=[compile_kernels(config.dtype).join])
     if config.backend != "triton" or len(scene.train) == 0:
-        return lambda: None
-    threads = warm_up_kernels(gaussians, scene.train.cameras[0], options, config)
+        return KernelWarmUp()
+    from normlift_ns.rasterization.triton import kernel_calls  # noqa: PLC0415 (needs triton)
 
-    def wait() -> None:
-        for thread in threads:
-            thread.join()
-
-    return wait
+    rendering, sums = kernel_calls(gaussians, scene.train.cameras[0], **config.options)
+    early, lift = lift_calls(gaussians.means, options)
+    return KernelWarmUp(rendering, [*sums, *early], lift, load_triton)
 
 
-def warm_up_kernels(
-    gaussians: GaussianScene, camera: Camera, options: LiftOptions, config: RasterConfig
-) -> list[Thread]:
-    """Compile or load kernels in threads. Each runs a stage of the lift on a few Gaussians and discards the result.
+def lift_calls(
+    means: Float[Tensor, "n 3"], options: LiftOptions
+) -> tuple[list[Callable[[], None]], Callable[[int], list[Callable[[], None]]]]:
+    """Return calls that run stages of a lift on some Gaussians and discard the results, to compile their kernels.
 
-    The threads suppress errors, because the lift raises the same errors again.
+    Returns:
+        Calls for consensus and neighbors, and a function that returns those for lift and vote of a feature dimension.
     """
-    x, y = torch.arange(camera.width), torch.arange(camera.height)
-    labels = (2 * (y[:, None] * 2 // camera.height) + x * 2 // camera.width).int()  # the quarters of the image
-    sample = gaussians.select(slice(_WARM_UP_GAUSSIANS))
-    means, regions = sample.means, _WARM_UP_REGIONS
-    features = torch.eye(regions, _WARM_UP_DIMENSION, dtype=config.dtype, device=means.device)
+    means, regions = means[:_WARM_UP_GAUSSIANS], _WARM_UP_REGIONS
+    n, device = len(means), means.device
+    votes = options.refine and n > options.vote.k
 
-    def rasterize() -> None:
-        rasterize_evidence(sample, [camera], [labels], num_regions=[regions], **config.options)
+    def evidence() -> Evidence:
+        gaussian = torch.arange(n, dtype=torch.int32, device=device)
+        entries = Entries(gaussian, gaussian % regions + 1, torch.ones(n, device=device), (regions,))
+        return Evidence.from_entries([entries], n)
 
-    def lift_sample() -> None:
-        gaussian = torch.arange(len(sample), dtype=torch.int32, device=means.device)
-        entries = Entries(gaussian, gaussian % regions + 1, means.new_ones(len(sample), dtype=config.dtype), (regions,))
-        evidence = Evidence.from_entries([entries], len(sample))
+    def agree() -> None:
         if options.consensus:
-            consensus(evidence, features)
-        lift(evidence, features, beta=options.reliability_beta, unlabeled=options.unlabeled).directions()
+            consensus(evidence(), torch.eye(regions, device=device))
 
-    def vote() -> None:
-        if options.refine and len(sample) > options.vote.k:
-            rows, ones = features[torch.arange(len(sample)) % regions], means.new_ones(len(sample))
-            refine(means, rows, ones, options.vote, own=ones, neighbors=nearest_neighbors(means, options.vote.k))
+    def find_neighbors() -> None:
+        if votes:
+            nearest_neighbors(means, options.vote.k)
 
-    def run(stage: Callable[[], None]) -> None:
-        with suppress(Exception), torch.no_grad():  # as the docstring says
-            stage()
+    def of_dimension(dimension: int) -> list[Callable[[], None]]:
+        features = torch.zeros(regions, dimension, device=device)
+        features[:, 0] = 1
 
-    threads = [
-        Thread(target=run, args=(x,), name="kernel warm-up", daemon=True) for x in (rasterize, lift_sample, vote)
-    ]
-    for thread in threads:
-        thread.start()
-    return threads
+        def lift_sample() -> None:
+            lifted = lift(evidence(), features, beta=options.reliability_beta, unlabeled=options.unlabeled)
+            lifted.directions()
+            lifted.evidence.rows.matmul(features[:, :1].double())  # as `basis_of_rank` does
+
+        def vote() -> None:
+            if votes:
+                rows, ones = features[torch.arange(n, device=device) % regions], torch.ones(n, device=device)
+                refine(means, rows, ones, options.vote, own=ones, neighbors=nearest_neighbors(means, options.vote.k))
+
+        return [lift_sample, vote]
+
+    return [agree, find_neighbors], of_dimension

@@ -514,6 +514,8 @@ _SLOW_FIRST_VIEW_S = 20.0
 
 These seconds include an unknown time to load networks.
 """
+_DIMENSION = 512
+"""Dimension of the features for which kernels are loaded."""
 _MAX_LOOKUPS = 16
 """Maximum number of views to look up in the cache."""
 
@@ -529,8 +531,9 @@ def time_kernel_loading(scene: Scene, options: LiftOptions, *, device: str = "cp
     """Load or compile the kernels of a lift; return the seconds that the next process needs to load them."""
     gaussians = scene.gaussians.to(device)
     config = pipeline.choose_raster_config(scene, gaussians, options)
-    ready = pipeline.start_kernel_warm_up(scene, gaussians, options, config)
-    return min(_MAX_LOAD_S, _seconds(ready, clock=perf_counter, device=device)[0])
+    kernels = pipeline.start_kernel_warm_up(scene, gaussians, options, config)
+    kernels.start_lift(_DIMENSION)
+    return min(_MAX_LOAD_S, _seconds(kernels.wait, clock=perf_counter, device=device)[0])
 
 
 def measure_capture(
@@ -557,7 +560,7 @@ def measure_capture(
     gaussians, used, drawing = collection.gaussians, collection.views, collection.config
     cuda = torch.device(device).type == "cuda"
     timed = partial(_seconds, clock=clock, device=device)
-    pipeline.start_kernel_warm_up(scene, gaussians, options, drawing)()
+    pipeline.start_kernel_warm_up(scene, gaussians, options, drawing).wait()
     rendered = drawing.settings if options.image_source == "render" else None
 
     def observe(indices: Sequence[int], source: FeatureSource) -> _Observed:

@@ -2,10 +2,12 @@
 
     python -m research.clients               lifts the fox capture first
     python -m research.clients --load-config outputs/room/normlift/demo/config.yml
+    taskset -c 0,1 python -m research.clients --clients-on 2 3
 
 64 clients ask one question every 2 s over HTTP for 60 s. Half of the questions are prompts that have been asked before,
 half are new. Every answer has the relevancies and the mask of all Gaussians. The clients run in one process on the
-cores of the server; their share of the processor time is reported. Prompts are names of colors, for the encoder color.
+cores of the server, or on those of `--clients-on`. Shares are of the processor time of the server's cores. Prompts are
+names of colors, for the encoder color.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import os
 import random
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle, permutations
 from pathlib import Path
@@ -93,17 +95,19 @@ async def ask_all(server: ViewServer, run: str, log: Log) -> tuple[int, int]:
     return settled, server.resident()
 
 
-def add_clients(report: Report, config: Path) -> None:
+def add_clients(report: Report, config: Path, clients_on: Sequence[int] = ()) -> None:
     """Adds the metrics of a lifted run, with the encoder color."""
-    log = Log()
+    log, cores = Log(), len(os.sched_getaffinity(0))
     with served(config) as server:
+        if len(clients_on) > 0:
+            os.sched_setaffinity(0, clients_on)
         run = server.run()
         for prompt in COLOURS:
             urlopen(f"http://127.0.0.1:{server.port}/api/runs/{run}/query", json.dumps({"texts": [prompt]}).encode())
         start, worked, own = time.perf_counter(), server.worked(), time.process_time()
         settled, end = asyncio.run(ask_all(server, run, log))
         wall = time.perf_counter() - start
-        share = (time.process_time() - own) / (wall * len(os.sched_getaffinity(0)))
+        share = (time.process_time() - own) / (wall * cores)
         used = server.worked() - worked
     for error in sorted(set(log.errors)):
         print(f"{log.errors.count(error)} times: {error}")
@@ -114,11 +118,7 @@ def add_clients(report: Report, config: Path) -> None:
     report.add("server_s_per_answer", used / len(log.seconds), "s of processor time of the server per answer")
     report.add("received_bytes_per_s", log.received / wall, "bytes of relevancies and masks per s")
     report.add("clients_share", share, "share of all processor time that the clients take")
-    report.add(
-        "server_share",
-        used / (wall * len(os.sched_getaffinity(0))),
-        "share that the server takes",
-    )
+    report.add("server_share", used / (wall * cores), "share that the server takes")
     report.add("resident_settled_bytes", settled, f"bytes of memory of the server after {SETTLED:.0f} s")
     report.add("resident_growth_bytes", end - settled, "bytes of memory more at the end")
 
@@ -126,9 +126,10 @@ def add_clients(report: Report, config: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--load-config", type=Path, help="lifted run; by default the fox capture is lifted first")
+    parser.add_argument("--clients-on", type=int, nargs="+", default=(), help="cores of the clients")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     found = Report("clients")
     with tempfile.TemporaryDirectory() as folder:
-        add_clients(found, arguments.load_config or fox_run(Path(folder)))
+        add_clients(found, arguments.load_config or fox_run(Path(folder)), arguments.clients_on)
     found.write(arguments.output)

@@ -34,6 +34,7 @@ from torch.nn.functional import normalize
 from normlift_ns.encoders import base as source_module
 from normlift_ns.encoders.base import PatchFeatures, RegionFeatures
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
+from normlift_ns.segmentation import mask_filtering
 from normlift_ns.segmentation import sam as network_module
 from normlift_ns.segmentation import sam as sam_module
 from normlift_ns.segmentation.mask_filtering import Suppression, mask_nms, remove_small_regions
@@ -158,8 +159,8 @@ STEPS = {
     "measure": (SamNetwork, "measure"),
     "distinct": (sam_module, "_distinct"),
     "whole": (SamMasks, "_image_masks"),
-    "clean": (sam_module, "clean_masks"),
-    "nms": (sam_module, "mask_nms"),
+    "clean": (mask_filtering, "remove_small_regions"),
+    "nms": (mask_filtering, "mask_nms"),
     "stack": (sam_module, "stack_masks"),
 }
 

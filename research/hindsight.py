@@ -7,8 +7,11 @@ cosine; a share of the top cosine; a share of the way from the median to the top
 the same number of Gaussians for all, as a share; the most stable threshold, with another range. The number is the one
 with the largest mean over prototypes of IoU divided by the best IoU of the cosine.
 
-Keys: <capture>.<family>.mean, .worst, .number and .below (prototypes under 40 %); <capture>.default likewise;
-<capture>.<label>.best, the best IoU, .share, of the pixels, and .<family>, the share of the best IoU reached.
+Keys: <capture>.<family>.mean, .worst and .below (the number under 40 %), over prototypes; <capture>.default likewise;
+<capture>.<label>.best, the best IoU, and .share, of the pixels. The numbers themselves are printed.
+
+What came of it: on the castle, which confirms the default threshold, a fixed cosine of 0.74 would reach 71 % in the
+mean, all other families 64 % or less, and each leaves at least one prototype below 7 %. The default reaches 55 %.
 """
 
 from __future__ import annotations

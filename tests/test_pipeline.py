@@ -6,6 +6,8 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
 from unittest.mock import MagicMock
@@ -26,13 +28,12 @@ from normlift_ns.evaluation.lerf import run_lerf
 from normlift_ns.evaluation.options import LerfOptions, MaskOptions
 from normlift_ns.evaluation.protocols import EvaluatedRun, mask_truth
 from normlift_ns.evaluation.studies import voting_scalars
-from normlift_ns.evidence_collection import RasterConfig
 from normlift_ns.options import VOTE_DEFAULTS
 from normlift_ns.pipeline import lift_scene, min_agreement
 from normlift_ns.progress import lift_cost
 from normlift_ns.rendering.figures import training_cameras, unique_file_names
 from normlift_ns.segmentation.regions import LabelFiles, resample_nearest
-from tests.random_scenes import Photographs, generator, made_scene
+from tests.random_scenes import Photographs, generator, made_scene, orbit, random_scene
 
 WIDTH, HEIGHT, N = 24, 18, 30
 POSE = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]])
@@ -220,20 +221,40 @@ def test_costs_are_seconds_their_sum_and_the_memory_of_this_process(monkeypatch)
     assert found == {"a_s": 1.0, "b_s": 0.5, "total_s": 1.5}
 
 
-def test_a_rehearsal_rasterizes_all_its_regions(monkeypatch):
-    seen: list[torch.Tensor] = []
-    rasterize = nl.pipeline.rasterize_evidence
+@pytest.mark.skipif(torch.cuda.is_available(), reason="watches Triton's interpreter")
+def test_kernels_that_are_compiled_ahead_are_those_of_a_lift(monkeypatch):
+    """The same kernels with the same types and constants, so that a lift compiles none of them again."""
+    interpreter = pytest.importorskip("triton.runtime.interpreter")
+    backend = import_module("normlift_ns.rasterization.triton")
+    seen: set[Any] = set()
+    run = interpreter.InterpretedFunction.run
 
-    def watched(scene: Any, cameras: Any, labels: list[torch.Tensor], **how: Any) -> Any:
-        seen.extend(labels)
-        return rasterize(scene, cameras, labels, **how)
+    def watched(self: Any, *given: Any, **named: Any) -> Any:
+        types = tuple(x.dtype if isinstance(x, torch.Tensor) else type(x) for x in given)
+        constants = {name: x for name, x in named.items() if name not in ("grid", "warmup")}
+        seen.add((self.fn.__name__, types, tuple(sorted(constants.items()))))
+        return run(self, *given, **named)
 
-    monkeypatch.setattr(nl.pipeline, "rasterize_evidence", watched)
-    config = RasterConfig("1.4", "numba", torch.float32, "classic", 1)
-    for thread in nl.pipeline.warm_up_kernels(scene("a.png").gaussians, CAMERA, nl.LiftOptions(), config):
-        thread.join()
-    assert seen[0].shape == (HEIGHT, WIDTH)
-    assert torch.bincount(seen[0].flatten()).tolist() == [HEIGHT * WIDTH // 4] * 4
+    monkeypatch.setattr(interpreter.InterpretedFunction, "run", watched)
+    gaussians, cameras = random_scene(40, dtype=torch.float32), orbit(2, width=32, height=24)
+    options: Any = {"rasterize_mode": "classic", "settings": nl.RasterSettings(), "dtype": torch.float32}
+    for call in chain(*backend.kernel_calls(gaussians, cameras[0], weight_power=1, **options)):
+        call()
+    ahead = set(seen)
+    seen.clear()
+    job = backend.RasterJob(gaussians, False, nl.RasterSettings(), torch.float32)
+    labels = [torch.zeros(24, 32, dtype=torch.int32)] * 2
+    backend.views_evidence(job, backend.RasterBatch(cameras, labels, [1, 1]))
+    backend.composite(job, cameras[0], torch.ones(40, 3))
+    assert len(seen) == 9
+    assert seen <= ahead
+
+
+def test_stages_run_ahead_do_not_fail():
+    """Their errors would be suppressed."""
+    early, lift = nl.pipeline.lift_calls(random_scene(60, dtype=torch.float32).means, nl.LiftOptions())
+    for call in (*early, *lift(7)):
+        call()
 
 
 def test_neighbours_and_vote_report_gaussians(monkeypatch, tmp_path):

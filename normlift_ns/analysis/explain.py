@@ -29,10 +29,9 @@ from normlift_ns import evidence_collection
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.consensus import CHANCE_AGREEMENT, consensus
 from normlift_ns.core.evidence import Evidence
-from normlift_ns.core.field import SemanticField
+from normlift_ns.core.field import CHANGED_COSINE, SemanticField
 from normlift_ns.core.lift import lift, norm_of_reliability
 from normlift_ns.core.lowrank import StoredEvidence
-from normlift_ns.core.refine import CHANGED_COSINE
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.base import FeatureSource
@@ -387,11 +386,16 @@ class RecordedVotes:
 
     @property
     def disagreement(self) -> float:
-        """Usual disagreement of the views about a Gaussian before the consensus, 1 - median ||f_j||."""
-        norm = self.field.scalars.norm
+        """Usual disagreement of the views about a Gaussian: 1 - median ||f_j||, the mean of before and after the
+        consensus.
+        """
+        scalars = self.field.scalars
+        if not bool((scalars.norm > 0).any()):
+            return 1.0
+        norms = [scalars.norm.double()]
         if self._option("reliability", str, "paper") == "paper":
-            norm = norm_of_reliability(self.field.scalars, self._option("reliability_beta", float, 1.0))
-        return 1 - float(norm[norm > 0].median()) if bool((norm > 0).any()) else 1.0
+            norms.append(norm_of_reliability(scalars, self._option("reliability_beta", float, 1.0)))
+        return 1 - sum(float(norm[norm > 0].median()) for norm in norms) / len(norms)
 
     def _cached_evidence(self, block: evidence_collection.ViewBatch) -> Evidence:
         config = evidence_collection.RasterConfig(

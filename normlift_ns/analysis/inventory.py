@@ -2,8 +2,8 @@
 
 Two neighboring Gaussians get a count from each image in which both have a region. The count is 1 if both have the same
 region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s = 1 - median ||f_j||
-before the consensus measures how much the views usually disagree. The affinity of two parts is the mean of the counts
-over all images and all pairs of neighbors across their border::
+measures how much the views usually disagree, the mean of before and after the consensus. The affinity of two parts is
+the mean of the counts over all images and all pairs of neighbors across their border::
 
     a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
 
@@ -184,7 +184,7 @@ def find_inventory(
     Args:
         features: One unit row per column (region) of the evidence.
         means: Centers of the Gaussians.
-        spread: Usual disagreement of the views about a Gaussian before the consensus, 1 - median ||f_j||.
+        spread: Usual disagreement of the views about a Gaussian, `RecordedVotes.disagreement`.
     """
     evidence = evidence.to("cpu")
     part = _join(len(means), _neighbor_borders(view_regions(evidence), features.cpu(), means.cpu(), spread))

@@ -45,8 +45,8 @@ class OrientedBox:
     """Box with arbitrary orientation.
 
     >>> box = oriented_box(np.array([[x, y, z] for x in (0, 8) for y in (0, 4) for z in (0, 2)], float))
-    >>> box.size.round(2).tolist(), box.center.round(2).tolist(), abs(box.axes).round(2).tolist()[0]
-    ([8.0, 4.0, 2.0], [4.0, 2.0, 1.0], [1.0, 0.0, 0.0])
+    >>> [x.round(decimals=2).tolist() for x in (box.size, box.center, abs(box.axes[0]))]
+    [[8.0, 4.0, 2.0], [4.0, 2.0, 1.0], [1.0, 0.0, 0.0]]
     """
 
     center: Float64[Tensor, " 3"]

@@ -99,9 +99,11 @@ class NormLiftCheck(NormLift):
             stand_in = "without these weights, the plan describes a lift with --encoder color"
             advice = "add the time of the networks, or fetch the weights and check again"
             rows.append(Diagnostic("plan", "warning", stand_in, advice))
-        return rows, self._plan(rows, opened, source, device)
+        return rows, self._plan_opened(rows, opened, source, device)
 
-    def _plan(self, rows: list[Diagnostic], opened: OpenedCapture, source: FeatureSource, device: str) -> Plan | None:
+    def _plan_opened(
+        self, rows: list[Diagnostic], opened: OpenedCapture, source: FeatureSource, device: str
+    ) -> Plan | None:
         """Plan the lift, and add findings about its memory and its disk space."""
         from normlift_ns import planning  # noqa: PLC0415
 

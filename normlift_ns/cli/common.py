@@ -560,7 +560,7 @@ def _class_definitions(module: str) -> dict[str, list[ast.stmt]]:
     return {}
 
 
-def field_docstrings(options: type) -> dict[str, str]:
+def field_docstrings(options: Any) -> dict[str, str]:
     """Return the docstring under each field of a dataclass, by the name of the field."""
     texts: dict[str, str] = {}
     for field, text in pairwise(_class_definitions(options.__module__).get(options.__name__, [])):

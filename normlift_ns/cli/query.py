@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from normlift_ns.cli import common
@@ -134,6 +136,8 @@ class NormLiftQuery(CheckedOptions):
         """Run the query, write files, print the table and return its rows; none with --stdin or --interactive."""
         self._check()
         common.info_opening(self.load_config)
+        if self.render_dir is not None:  # torch loads while the run answers without it
+            Thread(target=import_module, args=("normlift_ns.rendering.figures",), daemon=True).start()
         if self.inventory:
             return self._list_inventory()
         run = self._open()

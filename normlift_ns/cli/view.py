@@ -116,10 +116,10 @@ class NormLiftView(ServeOptions):
 
 
 def open_all(server: WarmServer) -> None:
-    """Open the runs of a server, and start a thread for each that prepares the data of its first page."""
-    runs = [server.runs.get(name) for name in server.runs.ids]
-    for run in runs:
-        threading.Thread(target=run.warm_up, daemon=True).start()
+    """Open the runs of a server, and start a thread that prepares the data of their first pages."""
+    for name in server.runs.ids:
+        server.runs.get(name)
+    threading.Thread(target=server.runs.warm_up, daemon=True).start()
 
 
 def until_stopped() -> NoReturn:

@@ -8,10 +8,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from itertools import islice
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any, TypeVar, cast
 
 import torch
@@ -79,7 +80,7 @@ def retry_in_halves(run: Callable[[Items], Result], items: Items, advice: str) -
 
 
 def init_cuda(device: str) -> None:
-    """Initialize CUDA in a background thread, because it takes about a second.
+    """Initialize CUDA and Triton in background threads, because both take about a second.
 
     Errors are ignored here. They occur again at the first use of the GPU.
     """
@@ -88,8 +89,23 @@ def init_cuda(device: str) -> None:
         with suppress(Exception):
             torch.empty(1, device=device)
 
-    if device.startswith("cuda"):
-        Thread(target=start, name="init-cuda", daemon=True).start()
+    for work in (start, load_triton) if device.startswith("cuda") else ():
+        Thread(target=work, name="init-cuda", daemon=True).start()
+
+
+_triton_lock = Lock()
+
+
+def load_triton() -> None:
+    """Load what all kernels of Triton need, once in this process: a hash of Triton's files and its driver.
+
+    Without the lock, every thread that compiles a kernel would compute the hash and compile the driver. Errors are
+    ignored here. They occur again in the first kernel.
+    """
+    with _triton_lock, suppress(Exception):
+        if has_triton():
+            import_module("triton.runtime.cache").triton_key()
+            import_module("triton.runtime").driver.active.get_current_target()
 
 
 def choose_device(device: str) -> str:

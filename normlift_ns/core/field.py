@@ -38,6 +38,9 @@ from normlift_ns.io.guard import refuse_inputs, refuse_other_kinds
 from normlift_ns.io.run_dir import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, write_manifest
 from normlift_ns.options import RelevancyRule, Storage
 
+CHANGED_COSINE = 0.98
+"""Cosine of the directions before and after the vote below which a Gaussian counts as changed, about 11 degrees."""
+
 
 @check_arguments
 @dataclass(frozen=True)

@@ -24,11 +24,6 @@ _CHUNK_ELEMENTS = (2**22, 2**24)
 """Number of elements of the largest tensor of a vote in torch, on CPU and GPU. The CPU limit suits its caches."""
 _BLOCK = (2 * PARTITION_BLOCK, 16 * PARTITION_BLOCK)
 """Number of Gaussians per block, on CPU and GPU. Directions of one block and its neighbors are in memory at a time."""
-CHANGED_COSINE = 0.98
-"""Limit on the cosine between the directions of a Gaussian before and after the vote, about 11 degrees.
-
-Below the limit, the Gaussian counts as changed.
-"""
 MAX_VOTERS = 256
 """Largest K of a vote. Time grows with the square of K, because a vote compares all pairs of neighbors."""
 _MAX_KERNEL_NEIGHBORS = 63

@@ -6,7 +6,7 @@ Gaussians are processed in the same blocks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -38,7 +38,7 @@ from normlift_ns.distributed.communicator import (
     gather_sparse,
     redistribute_evidence,
 )
-from normlift_ns.evidence_collection import EvidenceCollection, ViewObservations, chunk_views
+from normlift_ns.evidence_collection import EvidenceCollection, Kernels, ViewObservations, chunk_views
 from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.lifted_run import LiftedRun
 from normlift_ns.options import LiftOptions
@@ -57,17 +57,17 @@ def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> L
         api.check_target(prepared)
     api.announce(prepared)
     if team.rank == 0:
-        api.check_alignment(prepared, before)
+        api.check_alignment(prepared, before, lambda: None)
     cache, device = cache_folder(run_dir), prepared.device
     collection = pipeline.plan_collection(
         prepared.scene, prepared.source, prepared.lift, cache, device=device, export=request.export
     )
     stages, facts = StageTimer(team.aggregate_progress(request.report)), {}
     options, means = collection.options, collection.gaussians.means
-    wait_for_kernels = pipeline.start_kernel_warm_up(collection.scene, collection.gaussians, options, collection.config)
+    kernels = pipeline.start_kernel_warm_up(collection.scene, collection.gaussians, options, collection.config)
     portion = Partition.from_means(team, means)
     with team.shared_folder(cache):
-        views = _collect(team, collection, portion, stages, wait_for_kernels)
+        views = _collect(team, collection, portion, stages, kernels)
     table = views.features
     if options.consensus:
         with stages("consensus") as step:
@@ -110,18 +110,19 @@ def _collect(
     collection: EvidenceCollection,
     portion: Partition,
     stages: StageTimer,
-    wait_for_kernels: Callable[[], None],
+    kernels: Kernels,
 ) -> ViewObservations:
     """Collect the chunks that this process can claim; return all views for the Gaussians of this process."""
     chunks = chunk_views(collection.views, team.world_size)
     tables: dict[int, tuple[Tensor, Tensor]] = {}
     pieces: dict[int, EvidenceShard] = {}
     for index in team.claim_chunks(len(chunks)):
-        evidence, features, level = collection.collect_chunk(chunks[index], stages, wait_for_kernels)
+        evidence, features, level = collection.collect_chunk(chunks[index], stages, kernels)
         tables[index] = features, level
         with stages("evidence", len(collection.views)):
             pieces[index] = EvidenceShard.split(evidence, portion)
     with stages("exchange"):
+        kernels.wait()
         evidence = redistribute_evidence(pieces, portion, len(chunks))
         features, level = _gather_tables(tables, team)
     return ViewObservations(evidence, features.to(portion.order.device, collection.config.dtype), level)

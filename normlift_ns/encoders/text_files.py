@@ -302,12 +302,11 @@ class CachedTextEncoder(LazyTextEncoder):
         paths = {key: self._path("\n".join(key)) for key in keys}
         blocks = {key: self._load(path, len(key)) for key, path in paths.items()}
         new = [key for key, block in blocks.items() if block is None]
-        made = self._encoder.text([prompt for key in new for prompt in key]).numpy() if len(new) > 0 else np.empty(0)
-        for key, block in zip(new, np.split(made, len(new)) if len(new) > 0 else []):
-            blocks[key], path = block, paths[key]
-            if path is not None:
-                with suppress(OSError):
-                    save_arrays(path, {_ARRAY: block[0] if len(key) == 1 else block}, key=path.stem, overwrite=True)
+        if len(new) > 0:
+            made = self._encoder.text([prompt for key in new for prompt in key]).numpy()
+            for key, block in zip(new, np.split(made, len(new))):
+                blocks[key] = block
+                self._store(paths[key], block)
         rows = {prompt: row for key, block in blocks.items() if block is not None for prompt, row in zip(key, block)}
         return np.stack([rows[prompt] for prompt in prompts])
 
@@ -326,6 +325,12 @@ class CachedTextEncoder(LazyTextEncoder):
 
     def _path(self, prompt: str) -> Path | None:
         return None if self.folder is None else cache_path(self.folder, self.identity, prompt.encode())
+
+    def _store(self, path: Path | None, block: Float32[np.ndarray, "q d"]) -> None:
+        """Write the vectors of some prompts to the cache; do nothing if it cannot be written."""
+        if path is not None:
+            with suppress(OSError):
+                save_arrays(path, {_ARRAY: block[0] if len(block) == 1 else block}, key=path.stem, overwrite=True)
 
     def _load(self, path: Path | None, count: int) -> Float32[np.ndarray, "q d"] | None:
         """Return the cached vectors of some prompts, or None if they are missing, damaged or not unit vectors."""

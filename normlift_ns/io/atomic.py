@@ -361,7 +361,8 @@ def commit_directory(draft: Path, path: Path, *, replaced: Callable[[Path], Coll
     """Rename a folder from `draft_directory` to its final path; return False if the path exists and `replaced` is None.
 
     The system exchanges an existing folder with the new one, so the path exists at every instant. If the system cannot
-    exchange folders, a journal records the steps. The next command that opens or writes the run then completes them.
+    exchange folders, two renames replace the folder. A journal records them, so that after a crash, the next command
+    that opens or writes the run completes them.
 
     Args:
         replaced: Function that returns the files of an existing folder that the new folder replaces, as relative

@@ -69,7 +69,7 @@ class EvidenceArrays(NamedTuple):
     region_view: Int32[np.ndarray, " s"]
     unlabeled: RowArrays
     counts: tuple[int, int, int]
-    """Number of views, power of the weights, and number of excluded Gaussians."""
+    """Number of views, exponent of the weights A_ij in the sums, and number of excluded Gaussians."""
     digest: str | None
     """Digest of the content; None for files of version 0.1."""
 
@@ -131,7 +131,7 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
 
 
 def read_field(folder: Path) -> FieldArrays:
-    """Read the files that `SemanticField.save` wrote, and check all digests.
+    """Read the files that `SemanticField.save` wrote, and check their digests.
 
     Raises:
         FileNotFoundError: The folder has no complete field.

@@ -154,7 +154,7 @@ def run_file_digests(folder: Path, files: Iterable[Path]) -> dict[str, str]:
 
 
 def add_digest_comment(config: str) -> str:
-    """Return the text of a config.yml after a comment with its digest, by which later edits are detected."""
+    """Return the text of a config.yml with its digest in a comment above, so that later edits are detected."""
     return f"{_SEAL}{text_digest(config)} (to change them without a warning, delete this line)\n{config}"
 
 
@@ -191,8 +191,8 @@ def refuse_existing_run(run_dir: Path, overwrite: bool, source: Path | None = No
 def written_files(run_dir: Path) -> set[str]:
     """Return the paths of the files that a lift wrote, relative to the run directory.
 
-    They are config.yml, the manifest, the stored queries, and the files in the manifest. If the manifest is damaged or
-    from version 0.1, the default names of all files that a lift writes are used instead of its list.
+    They are config.yml, the manifest, the stored queries, and the files that the manifest lists. If the manifest is
+    damaged or from version 0.1, the default names of all files that a lift writes are used instead of its list.
     """
     names = {"config.yml", *(f"{FIELD_FOLDER}/{name}" for name in (MANIFEST_FILE, "queries.safetensors"))}
     try:

@@ -21,15 +21,23 @@ from normlift_ns.kernels.projection_2dgs import SPLAT_2D
 
 _BLOCK = 32
 _ROUNDING = tl.constexpr(2.0**-20)
-"""Relative float32 rounding error of the squares in an exponent, at most 12 half units in the last place."""
-_REACH_MARGIN = tl.constexpr(1e-3)
-"""Margin of the largest relevant exponent, for rounding of the exponential and of the float64 computation here."""
-_NEEDLE = tl.constexpr(1e-6)
-"""Limit for the ratio of a determinant to the product of its diagonal.
+"""Bound on the relative float32 rounding error of a dx^2 and c dy^2 in the exponent of alpha.
 
-Below this limit, the determinant is too inaccurate to cull a splat.
+The error is at most 12 half units in the last place.
+"""
+_REACH_MARGIN = tl.constexpr(1e-3)
+"""Margin added to the exponent log(opacity / min_alpha), at which alpha falls to its threshold.
+
+It covers the rounding of the exponential in gsplat and of the float64 computation here.
+"""
+_NEEDLE = tl.constexpr(1e-6)
+"""Smallest ratio of the determinant of a conic to the product of its diagonal entries for which a splat is culled.
+
+Below this ratio, the determinant is too inaccurate.
 """
 _FAR = tl.constexpr(1e30)
+_SIZES = ("width", "height", "tiles_across", "tiles_down", "cells_across", "cells_down")
+"""Arguments of kernels that are compiled once for images of all sizes."""
 
 
 class CellGrid(NamedTuple):
@@ -71,7 +79,7 @@ class CellLists(NamedTuple):
     """Rows of the splats in `ProjectedSplats`."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["entries", "views", *_SIZES])
 def _pairs(
     splats, order, keys, starts, ends, out_count, out_cell, out_member, entries, views, width, height, min_alpha,
     tiles_across, tiles_down, cells_across, cells_down,
@@ -200,7 +208,7 @@ def build_cell_lists(
 UNROLL = 4
 """Number of splats between two checks whether all pixels of a cell are finished."""
 _MOST_SLOTS = 2**26
-"""Largest number of slots in a chunk, of 8 or 12 bytes each."""
+"""Largest number of slots in a chunk. A slot holds one sum and its key, and takes 8 or 12 bytes."""
 _COPIED = 128
 """Number of sums that a program of `_pack` copies in one step."""
 _PLACES = 512
@@ -219,7 +227,7 @@ class RegionSums(NamedTuple):
     """Nonzero sums for every cell, splat and region, ordered by cell. A key can occur in several cells."""
 
     key: Int[Tensor, " m"]
-    """Keys row * columns + label + 1, in which row is the row of the splat."""
+    """Keys row * columns + label + 1. The row is that of the splat in `ProjectedSplats`."""
     weight: Float32[Tensor, " m"]
 
 
@@ -239,7 +247,7 @@ def _unpack_floats(pair):
 
 @triton.jit
 def load_splat(splats, m, valid, IS_2D: tl.constexpr):
-    """Return u, v, opacity and nine numbers of the shape of a splat; an invalid splat has opacity 0.
+    """Return u, v, opacity and nine numbers that describe the shape of a splat; an invalid splat has opacity 0.
 
     For a 2D Gaussian, the nine numbers are its transform. For a 3D Gaussian, the first three are half of xx, half of yy
     and xy of its conic, and the others repeat xy.
@@ -281,7 +289,7 @@ def _exponent_2d(u, v, u0, u1, u2, v0, v1, v2, w0, w1, w2, px, py):
 def blend(
     u, v, opacity, a, b, c, d, e, f, g, h, i, px, py, T, max_alpha, min_alpha, min_transmittance, IS_2D: tl.constexpr
 ):  # fmt: skip
-    """Return A_ij of one splat and the transmittance behind the splat in all pixels; 0 for finished pixels."""
+    """Return A_ij of one splat and the transmittance behind it in all pixels; both are 0 for finished pixels."""
     sigma = _exponent(u, v, a, b, c, px, py)
     if IS_2D:
         sigma = _exponent_2d(u, v, a, b, c, d, e, f, g, h, i, px, py)
@@ -319,7 +327,7 @@ def _number_labels(
     tl.store(counts + cell, count)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["first_cell", "first_slot", "columns"])
 def _sum_regions(
     splats, members, offsets, local, table, counts, base, out_key, out_weight, out_used,
     first_cell, first_slot, columns, cells_across, cells, max_alpha, min_alpha, min_transmittance,
@@ -381,7 +389,7 @@ def _sum_regions(
     tl.store(out_used + cell - first_cell, slot - first)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["base", "first_slot"])
 def _pack(key, weight, base, used, ends, out_key, out_weight, first_slot, COPIED: tl.constexpr):
     """Move the used slots of a cell directly behind those of the previous cells."""
     cell = tl.program_id(0).to(tl.int64)
@@ -458,7 +466,7 @@ def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, in
     ]
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "columns", "views"])
 def _places(key, splat_keys, first, out_gaussian, out_column, count, columns, views, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = i < count
@@ -499,7 +507,7 @@ _CHANNELS = 8
 """Largest number of channels per program. More channels need more programs, which compute the weights again."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=_SIZES)
 def _composite(
     splats, members, offsets, gaussians, values, image, out_alpha, width, height, channels, cells_across,
     max_alpha, min_alpha, min_transmittance,

@@ -20,14 +20,14 @@ from torch import Tensor
 LEAF = 32
 SLOTS = 64
 SPARE = 4
-"""Number of candidates in addition to K, because float32 rounding can change the order of the last ones."""
+"""Number of candidates to keep in addition to the K nearest, because float32 rounding can change their order."""
 MAX_TREE_NEIGHBORS = SLOTS - SPARE
 _PAIRS = 2**24
-"""Number of distances per chunk of `brute_force_nearest`, of 8 bytes each plus their components."""
+"""Number of distances that `brute_force_nearest` computes at a time. Each takes 8 bytes, and 24 for its components."""
 _SORTED_IN_A_BLOCK = 4096
 """Largest number of points that torch sorts within one GPU block, without passes over memory."""
 _LEAVES = 2**14
-"""Number of leaves per launch. They contain half a million points, of 320 bytes each for K = 36."""
+"""Number of leaves per launch, with half a million points. The candidates of a point take 320 bytes for K = 36."""
 
 
 class GatheringProcesses(Protocol):
@@ -67,7 +67,7 @@ class NearestNeighbors(NamedTuple):
     distance: Float32[Tensor, "n k"]
     """Distances rounded from float64, padded with inf."""
     spacing: Float64[Tensor, " n"]
-    """Distance to the nearest candidate at another position, or inf if there is none."""
+    """Distance to the nearest point at another position among those that the search kept, or inf if there is none."""
     certain: Bool[Tensor, " n"]
     """False for points whose neighbors may be wrong."""
 

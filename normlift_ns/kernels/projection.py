@@ -175,7 +175,7 @@ def _splat(
     return visible, u, v, conic_x, conic_xy, conic_y, opacity, half_width, half_height, depth
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["gaussians", "views", "width", "height"])
 def _find_visible(
     means, quats, scales, opacities, drawable, cameras, out, gaussians, views, width, height,
     near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,
@@ -199,7 +199,7 @@ def _find_visible(
         tl.store(out + i * views + view, (visible & valid & (scaled_opacity >= min_alpha)).to(tl.int8), mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "views", "width", "height"])
 def _project_visible(
     means, quats, scales, opacities, cameras, keys, out_splat, out_depth, count, views, width, height,
     near_plane, far_plane, eps2d, frustum_margin, min_discriminant, min_compensation, radius_sigmas, min_alpha,

@@ -69,7 +69,7 @@ def _along_axis(last_a, last_b, last_c, a, b, c, inverse):
     return center, tl.fma(center, center, -square)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "views", "width", "height"])
 def _project(
     means, quats, scales, opacities, drawable, cameras, keys, out_visible, out_splat, out_depth, count, views,
     width, height, near_plane, far_plane, radius_sigmas, min_alpha,

@@ -1,7 +1,7 @@
 """Triton kernels for SAM, which measure masks and compute the upscaling of its mask decoder.
 
 The kernels combine SAM's two bilinear resizes into one separable filter with three taps per axis. One program measures
-some rows of one mask. It keeps three interpolated lines of logits in registers until a row needs other lines.
+some rows of one mask. It keeps three interpolated rows of logits in registers until a row of the mask needs others.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _ROWS = 64
 
 @triton.jit
 def _line(logits, line, first, w0, w1, w2, inside):
-    """Return a line of logits that is interpolated at the columns of the image."""
+    """Return a row of logits, interpolated at the columns of the image."""
     pointer = logits + line + first
     a = tl.load(pointer, mask=inside, other=0.0).to(tl.float32)
     b = tl.load(pointer + 1, mask=inside, other=0.0).to(tl.float32)
@@ -31,7 +31,7 @@ def _measure(
     logits, row_first, row_weights, column_first, column_weights, out, height, width, low_height, low_width, offset,
     ROWS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the pixel counts above offset and -offset, and the box x0, y0, x1, y1, of some rows to out[mask, part]."""
+    """Write the pixel counts above offset and -offset, and the box (x0, y0, x1, y1) of some rows to out[mask, part]."""
     mask = tl.program_id(0).to(tl.int64)
     mask_logits = logits + mask * low_height * low_width
     x = tl.arange(0, BLOCK)
@@ -89,10 +89,10 @@ def measure_masks(
 
     Args:
         logits: Logits at the resolution of the network.
-        row_first: First of the three lines of logits that row i of the image is interpolated from.
-        row_weights: Weights of the three lines for every row.
-        column_first: First of the three columns of logits for every column of the image.
-        column_weights: Weights of the three columns.
+        row_first: For every row of the image, the first of the three rows of logits that it is interpolated from.
+        row_weights: For every row of the image, the weights of the three rows of logits.
+        column_first: For every column of the image, the first of the three columns of logits.
+        column_weights: For every column of the image, the weights of the three columns of logits.
         offset: Distance of both thresholds from 0.
 
     Returns:

@@ -28,7 +28,7 @@ class RowNorms(NamedTuple):
     """Number of views with a positive weight."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["segments"])
 def _segment_sum(values, offsets, out, segments, ROWS: tl.constexpr):
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     start = tl.load(offsets + row, mask=row < segments, other=0)
@@ -49,7 +49,7 @@ def segment_sum(values: Float[Tensor, " m"], offsets: Int64[Tensor, " rows_plus_
     return out
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["rows"])
 def _product(offsets, column, weight, vector, out, rows, ROWS: tl.constexpr):
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     start = tl.load(offsets + row, mask=row < rows, other=0)
@@ -68,7 +68,7 @@ def multiply_vector(
     weight: Float[Tensor, " nnz"],
     vector: Float[Tensor, " s"],
 ) -> Float[Tensor, " n"]:
-    """Return the product E x of a sparse matrix and a vector, in the precision of x but summed in float64.
+    """Return the product E x of a sparse matrix E and a vector x, in the precision of x but summed in float64.
 
     The kernel is fast for many short rows.
     """
@@ -105,7 +105,7 @@ def _row_norms(
     offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
     dimension, min_share, max_entries, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Compute one row per program. Repeat a sum in float64 if it cancels or has many entries."""
+    """Compute one row per program. Repeat a sum in float64 if its terms nearly cancel or are many."""
     j = tl.program_id(0)
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
     if stop - start <= 1:  # no vector sum is needed, because rows of the table are unit vectors
@@ -176,7 +176,7 @@ def row_norms(
         weight: Weights of the entries.
         column_view: View of every column, non-decreasing.
         table: Unit rows F.
-        min_share: Ratio of the norm of a sum to its weight below which the sum is repeated in float64.
+        min_share: A sum is repeated in float64 if its norm is below `min_share` times the sum of its weights.
         max_entries: Number of entries above which a sum is repeated in float64.
     """
     n, dimension, device = len(offsets) - 1, table.shape[1], table.device
@@ -234,7 +234,7 @@ def unit_sums(
         column: Columns of the entries.
         weight: Weights of the entries.
         table: Unit rows F.
-        norms: Norm of every row of E.
+        norms: Norm of sum_s E_js F_s for every row j of E.
         dtype: Precision of the result.
         min_share: As in `row_norms`.
         max_entries: As in `row_norms`.
@@ -268,7 +268,7 @@ class SparseRowsLike(Protocol):
     def weight(self) -> Tensor: ...  # noqa: D102
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["rows"])
 def _row_max(offsets, column, value, out, rows, ROWS: tl.constexpr):
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     start = tl.load(offsets + row, mask=row < rows, other=0)
@@ -293,7 +293,7 @@ def row_max(
     return out
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["first", "columns"])
 def _products(a_offsets, a_column, a_weight, b_offsets, b_column, b_weight, out, first, columns, WIDTH: tl.constexpr):
     """Compute one row of A B per program. Rows of B are added in a fixed order.
 

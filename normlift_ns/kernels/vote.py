@@ -3,12 +3,13 @@
 Float32 rows u are split into u = h + l, with 11 bits each. Three products at the fastest rate of tensor cores,
 h h + h l + l h, give cosines with 22 bits. Most votes need only the first product.
 
-Let e be the largest |l| in the group. Assume that all products and sums are exact except for rounding errors of 2**-23
-relative to values of at most 1. Then |<h_j, h_k> - <u_j, u_k>| <= t with t = 2.02 e + (D + 16) 2**-23. The derivative
-of log(g (1 - g)) with respect to the cosine is at most 1 / gamma. Let f = exp(t / gamma) - 1. An error t of the cosine
-then changes a sigmoid g by at most f g (1 - g). Let A be the weighted sum of g, and W the sum of the weights. By
-Jensen's inequality, the error of A is at most f A (1 - A / W). The rounding of sums adds at most 3e-5. If these error
-intervals determine the winner, the vote is finished. Otherwise, it adds the remaining products and compares again.
+Let e be the largest |l| of a Gaussian and its neighbors. Assume that all products and sums are exact except for
+rounding errors of 2**-23 relative to values of at most 1. Then |<h_j, h_k> - <u_j, u_k>| <= t with
+t = 2.02 e + (D + 16) 2**-23. The derivative of log(g (1 - g)) with respect to the cosine is at most 1 / gamma. Let
+f = exp(t / gamma) - 1. An error t of the cosine then changes a sigmoid g by at most f g (1 - g). Let A be the
+weighted sum of g, and W the sum of the weights. By Jensen's inequality, the error of A is at most f A (1 - A / W).
+The rounding of sums adds at most 3e-5. If these error intervals determine the winner, the vote is finished.
+Otherwise, the kernel adds the other products and compares again.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def _winner(score, member, slot, valid, i, delta):
 
 @triton.jit
 def _certain(agreed, r, weight, slot, valid, spread, delta):
-    """Return True if all scores within their error intervals (see above) have the same winner, and False for NaN."""
+    """Return True if the winner is the same for all scores in their error intervals (see above); False for NaN."""
     share = agreed / tl.sum(weight, axis=0)  # A / W
     score = r * agreed
     error = score * (spread * (tl.maximum(1 - share, 0.0) + 1e-5) + 3e-5)
@@ -71,7 +72,7 @@ def _certain(agreed, r, weight, slot, valid, spread, delta):
     return (wins | (all_high <= own_low + delta)) & (spread < 100.0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["voters"])
 def _vote(
     voters, neighbors, distance, high, low, rough, row_of, reliability, own, source, dimension, k, tau, gamma, width,
     delta, prior, GROUP: tl.constexpr, COLUMNS: tl.constexpr, COLUMNS_LATER: tl.constexpr, STAGES: tl.constexpr,
@@ -188,7 +189,7 @@ def vote(
         tau: Threshold of the sigmoid.
         gamma: Width of the sigmoid.
         width: sigma_d, in the units of `distance`.
-        delta: Support by which a neighbor must exceed the Gaussian itself.
+        delta: Amount by which the support of a neighbor must exceed that of the Gaussian itself.
         own: Number of views that agree on each Gaussian's own direction, or None for the paper's vote.
         prior: Weight of the neighbors in a posterior vote, as a number of views.
         precision: Precision of the products of float32 directions. "halves" uses two halves of 11 bits each.
@@ -212,7 +213,7 @@ def vote(
     )  # fmt: skip
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n"])
 def _find_reliable(neighbors, reliability, out, n, k, ROWS: tl.constexpr, SLOTS: tl.constexpr):
     row, slot = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS), tl.arange(0, SLOTS)
     inside = (row < n)[:, None] & (slot < k)[None, :]
@@ -222,7 +223,7 @@ def _find_reliable(neighbors, reliability, out, n, k, ROWS: tl.constexpr, SLOTS:
 
 
 def has_reliable_neighbor(neighbors: Int32[Tensor, "m k"], reliability: Float[Tensor, " n"]) -> Bool[Tensor, " m"]:
-    """Return a mask of the Gaussians with a neighbor that has R > 0."""
+    """Return a mask of the Gaussians that have a neighbor with a reliability above 0."""
     n, k = neighbors.shape
     mask = torch.zeros(n, dtype=torch.int8, device=neighbors.device)
     if n > 0:
@@ -232,7 +233,7 @@ def has_reliable_neighbor(neighbors: Int32[Tensor, "m k"], reliability: Float[Te
     return mask.bool()
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["voters", "count"])
 def _mark(voters, neighbors, out, count, k, ROWS: tl.constexpr, SLOTS: tl.constexpr):
     row, slot = tl.program_id(0) * ROWS + tl.arange(0, ROWS), tl.arange(0, SLOTS)
     i = tl.load(voters + row, mask=row < count, other=0).to(tl.int64)

@@ -31,11 +31,11 @@ def trainer_config(
     image_scale: float = 1.0,
     **optimizers: Any,
 ) -> TrainerConfig:
-    """Return splatfacto's trainer config with a lift at the end. The viewer listens on 127.0.0.1 only.
+    """Return splatfacto's trainer config with a lift at the end of training. The viewer listens on 127.0.0.1 only.
 
     Args:
         source: Options of the 2D features (default: those of ns-normlift).
-        image_scale: Size of the training images relative to the files.
+        image_scale: Size of the training images relative to the image files.
         optimizers: Replacements for splatfacto's optimizers, by parameter name.
     """
     return TrainerConfig(

@@ -65,7 +65,7 @@ class LazyLpips(torch.nn.Module):
 
 
 _MIN_FOCAL = 1e-3
-"""Smallest focal length to render, as a fraction of the longer side of the image. Its inverse is the largest."""
+"""Smallest focal length to render, as a multiple of the longer side of the image. The largest one is its inverse."""
 
 
 @dataclass
@@ -222,7 +222,7 @@ class NormLiftModel(SplatfactoModel):
 
     @property
     def _settings(self) -> RasterSettings:
-        """Rasterizer settings of the lift, or those of gsplat 1.4 without a field."""
+        """Rasterizer settings of the lift, or those of gsplat 1.4 if no field is attached."""
         return RasterSettings.recorded({} if self._field is None else self._field.manifest)
 
     def get_image_metrics_and_images(

@@ -57,7 +57,7 @@ from normlift_ns.viewer.widgets import (
 )
 
 VISER_SCALE = 10.0
-"""Units of the viser scene per scene unit, nerfstudio's VISER_NERFSTUDIO_SCALE_RATIO."""
+"""Number of units of the viser scene per scene unit; VISER_NERFSTUDIO_SCALE_RATIO in nerfstudio."""
 
 
 class ClickListener:
@@ -252,13 +252,13 @@ def add_first_tab(gui: Any, label: str, icon: str) -> Any:
 
 
 _DELAY = 0.1
-"""Time without a change after which details are computed, in seconds."""
+"""Time in seconds after the last change of the state, after which objects and histograms are computed."""
 
 
 def explanation_of_run(folder: Path | None, field: SemanticField | None = None) -> Explanation:
-    """Return the explanations of a lifted run.
+    """Return an `Explanation` that uses the images of a lifted run.
 
-    The first explanation opens the run again, with its images.
+    The first call of its `compute` opens the run again, with its images.
 
     Args:
         folder: Folder of the semantic field, or None if the run is not stored yet.
@@ -319,7 +319,7 @@ class SearchPanel(Controller):
     """Search panel in nerfstudio's viewer.
 
     Args:
-        host: The `NormLiftModel`, untyped because its module imports this one.
+        host: The `NormLiftModel`, untyped because its module imports this module.
     """
 
     reading_message = "Reading the prompts. The first query also loads the text encoder, which takes a while."

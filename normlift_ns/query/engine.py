@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from normlift_ns.core.field import SemanticField
 
 Verdict = Literal["found", "weak match", "probably not here"]
-"""Presence of a prompt. found: it matches better than almost all unrelated words. probably not here: it matches no
-better than many of them."""
+"""Presence of a prompt in a scene. found: the prompt matches better than almost all unrelated words.
+weak match: it matches better than most of them. probably not here: it does not."""
 _CENTRAL = (0.05, 0.95)
 """Quantiles of the selected centers that bound their extent."""
 _SUMMARIZED = ("reliability", "weight")
@@ -255,7 +255,7 @@ class Finding:
 
     @property
     def read_as(self) -> str | None:
-        """Words of the prompt that the encoder uses; None if it ignores at most articles."""
+        """Words of the prompt that the encoder uses; None if it uses all words except articles, or none."""
         kind = find_encoder_kind(encoder_name(self.answer.field))
         known = "" if kind is None else kind.known_words(self.text)
         ignored = set(re.findall(r"\w+", self.text.lower())) - set(re.findall(r"\w+", known.lower()))
@@ -275,7 +275,7 @@ class Finding:
 
     @property
     def mean_reliability(self) -> float | None:
-        """Weighted mean of R over the selected Gaussians."""
+        """Weighted mean of the reliability R over the selected Gaussians."""
         return self._selection.mean_reliability
 
     @property
@@ -311,7 +311,7 @@ class SelectionStats(NamedTuple):
     extent: list[float] | None
     """Size of the box that contains the central 90 % of the selected centers along each axis."""
     mean_reliability: float | None
-    """Weighted mean of R over the selected Gaussians."""
+    """Weighted mean of the reliability R over the selected Gaussians."""
 
     @staticmethod
     def of(mask: Any, means: Any, reliability: Any, weight: Any) -> SelectionStats:
@@ -417,15 +417,15 @@ def apply_threshold(answer: Answer, question: Query) -> Answer:
 
 HISTOGRAM_BINS = 32
 _AT_TOP = 1e-3
-"""Fraction of the range of relevancies. A median whose distance from the top is smaller counts as being at the top."""
+"""Distance below which the median counts as being at the top, as a fraction of the range from minimum to top."""
 _EPSILON = 1e-6
 """Smallest width of a histogram, and distance of the suggested threshold below the top if all relevancies are equal."""
 _SMALLEST_OBJECT = 20
-"""Number of Gaussians of the smallest object that a suggested threshold may select."""
+"""Number of Gaussians that exceed u (see above) if the scene has 20,000 or more."""
 _STABLE_OVER = 0.2
-"""Change of f over which the selection must be stable."""
+"""Distance below and above f (see above) over which the fall of log N is measured."""
 _STEPS = 100
-"""Number of thresholds between the median and u at which the selected Gaussians are counted."""
+"""Number of steps from m to u (see above) at which the Gaussians above a threshold are counted."""
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
@@ -504,7 +504,7 @@ def draw_histogram(
 
 
 def suggested_range(field: HasManifest) -> tuple[float, float]:
-    """Return the range of the fraction f (see above) in which thresholds are suggested for the field's encoder."""
+    """Return the lowest and highest f (see above) of a suggested threshold for the field's encoder."""
     kind = find_encoder_kind(encoder_name(field))
     return EncoderKind.suggested if kind is None else kind.suggested
 
@@ -565,13 +565,16 @@ def _median_and_top(values: np.ndarray) -> tuple[float, float]:
 
 
 _FOUND_RANK, _WEAK_RANK = 0.9, 0.7
-"""Minimum ranks of a prompt for the verdicts "found" and "weak match"."""
+"""Minimum ranks of a prompt (see `null_rank`) for the verdicts "found" and "weak match"."""
 _FEWEST_NULL_WORDS = 100
-"""Minimum number of null words for a meaningful rank."""
+"""Minimum number of unrelated words (null words) for a meaningful `null_rank`."""
 
 
 def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
-    """Return the fraction of null words with a lower best cosine, in 0..1; None if the field has too few null words."""
+    """Return the rank of a prompt, in 0..1; None if the field has too few null words.
+
+    The rank is the fraction of unrelated words (null words) whose top cosine is below `top_cosine`.
+    """
     tops = (manifest.get("null_words") or {}).get("tops", ())
     return bisect_left(tops, top_cosine) / len(tops) if len(tops) >= _FEWEST_NULL_WORDS else None
 

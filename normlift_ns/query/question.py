@@ -41,7 +41,7 @@ def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
     """Split every text of an option with `split_prompts`.
 
     Raises:
-        ValueError: there are texts, but no prompts in them.
+        ValueError: There are texts, but no prompts in them.
     """
     prompts = tuple(dict.fromkeys(prompt for text in texts for prompt in split_prompts(text)))
     if len(texts) > 0 and len(prompts) == 0:
@@ -78,7 +78,7 @@ class Query:
     threshold: float = 0.5
     """Relevancy above which a Gaussian is selected."""
     min_reliability: float = 0.0
-    """Minimum R of a selected Gaussian, in 0..1."""
+    """Minimum reliability R of a selected Gaussian, in 0..1."""
     refined: bool = True
     """Use refined features."""
     encoder: str | None = None
@@ -118,12 +118,12 @@ def make_query(
         encode: Function that returns one embedding per text, from an encoder that fits the field.
         texts: Prompts.
         negatives: Negative prompts (default: those of the encoder, see `default_rule`).
-        relevancy: Relevancy rule. "auto" is the rule of the encoder if `negatives` is None, cosine if `negatives` is
+        relevancy: Relevancy rule. "auto" is the rule of `default_rule` if `negatives` is None, cosine if `negatives` is
             empty, and lerf otherwise.
-        threshold: Relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests.
-            None is the threshold of the encoder for its own rule, and otherwise that of `RELEVANCY_RULES`. For the rule
-            cosine with an encoder that has a different rule, None is "auto", because no threshold suits all encoders.
-        min_reliability: Minimum R of a selected Gaussian, in 0..1.
+        threshold: Relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests. If
+            None, the default rule of the field has the threshold of `default_rule`. Other rules have the threshold in
+            `RELEVANCY_RULES` if they need negatives. Otherwise None is "auto", because no threshold suits all encoders.
+        min_reliability: Minimum reliability R of a selected Gaussian, in 0..1.
         refined: Use refined features.
     Raises:
         ValueError: An argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
@@ -193,7 +193,7 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
 
 
 QUERIES_FILE = "queries.safetensors"
-"""Name of the file in the folder of the field. It has the embeddings as tensors, and all else as JSON metadata."""
+"""Name of the file in the folder of the field. It has the embeddings as tensors, and everything else as metadata."""
 _METADATA_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
 _REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save-query True"
 
@@ -201,7 +201,7 @@ NonBlankText = Annotated[str, msgspec.Meta(pattern=r"\S")]
 
 
 class _Metadata(msgspec.Struct, forbid_unknown_fields=True, rename={"rule": "form"}):
-    """JSON in the metadata of the file, a `Query` without its embeddings."""
+    """Content of the JSON metadata in the file: a `Query` without its embeddings."""
 
     texts: Annotated[tuple[NonBlankText, ...], msgspec.Meta(min_length=1)]
     negatives: tuple[NonBlankText, ...]

@@ -6,11 +6,12 @@ sum_v E_in / sum_v (E_in + E_out). The weights are those of the rasterizer that 
 The mask of a whole view can be wrong, because SAM 3 misses an object or confuses it with another one. Two rounds
 therefore determine the voting views. In the first round, all views in which SAM 3 found the prompt vote. In the second
 round, a view votes if the weighted intersection over union of its mask and the Gaussians selected in the first round
-exceeds one half. If SAM 3 found the prompt in none of these views, the result is that of the first round.
+exceeds one half, or if both are empty. If SAM 3 found the prompt in none of these views, the result is that of the
+first round.
 
-A view that does not vote is unlabeled, with `unlabeled="dilute"`, which lowers reliability. An object found in one of
-eight views therefore has the reliability of one view in eight. Agreement and reliability are those of `core.lift` for
-two regions per view, inside and outside, with the features (1, 0) and (0, 1).
+All pixels of a view that does not vote are unlabeled. With `unlabeled="dilute"`, they lower the reliability of the
+Gaussians that they show. Agreement and reliability are those of `core.lift` for two regions per view, inside and
+outside, with the features (1, 0) and (0, 1).
 """
 
 from __future__ import annotations
@@ -123,7 +124,7 @@ def mask_evidence(
 
     Args:
         cameras: One camera per view.
-        masks: One mask per view and prompt; empty if the prompt was not found.
+        masks: Masks of the Q prompts in each view. A mask is False everywhere if the prompt was not found.
         valid_pixels: Mask of the pixels to use in each view; None for all pixels.
         options: `rasterize_mode` and `settings` of `rasterize_evidence`.
     Raises:
@@ -161,7 +162,7 @@ class SegmentationResult(NamedTuple):
     found: Bool[Tensor, "q v"]
     """True for images in which SAM 3 found the prompt."""
     min_reliability: float = 0.0
-    """Minimum R of a selected Gaussian, in 0..1."""
+    """Minimum reliability R of a selected Gaussian, in 0..1."""
 
     def selected(self, text: int) -> Bool[Tensor, " n"]:
         """Return the mask of sufficiently reliable Gaussians with more than half of their weight inside the masks."""
@@ -215,7 +216,7 @@ def query_sam3(
         find_masks: Function that returns SAM 3's mask of each prompt in an image.
         texts: Prompts.
         views: Maximum number of views.
-        min_reliability: Minimum R of a selected Gaussian, in 0..1.
+        min_reliability: Minimum reliability R of a selected Gaussian, in 0..1.
         settings: Constants of the rasterizer.
         device: Device of the rasterizer.
     Raises:

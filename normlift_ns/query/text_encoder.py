@@ -30,11 +30,11 @@ ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "
 PRECOMPUTED = "given"
 """Encoder name in the manifest for features provided by the user."""
 _CHOSEN = "texts_chosen"
-"""Key in the manifest of an open run if the user replaced the text embeddings of the lift with another file."""
+"""Manifest key that is set in memory if the user replaced the text embeddings of the lift with another file."""
 
 
 class DefaultRule(NamedTuple):
-    """Default relevancy rule of an encoder, with negatives and threshold. The threshold "auto" is the suggested one."""
+    """Default relevancy rule of an encoder, with negatives and threshold. "auto" means the suggested threshold."""
 
     rule: RelevancyRule
     negatives: tuple[str, ...]
@@ -46,7 +46,7 @@ _CONTRAST = DefaultRule("contrast", (), 0.5)
 
 
 class HasManifest(Protocol):
-    """Interface of a semantic field, of tensors or NumPy arrays, that has a manifest."""
+    """Interface of objects with a manifest, such as semantic fields of tensors or NumPy arrays."""
 
     @property
     def manifest(self) -> Mapping[str, Any]:
@@ -131,7 +131,10 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
 def _cached_texts(
     options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
 ) -> CachedTextEncoder:
-    """Return a cached text encoder, which loads the network for new prompts and compares it with that of the lift."""
+    """Return a text encoder with a cache.
+
+    It loads its network for new prompts, and raises InputError if the network is not that of the lift.
+    """
 
     def network() -> Any:
         from normlift_ns.core.device import choose_device  # noqa: PLC0415 (needs torch)
@@ -153,7 +156,7 @@ def _cached_texts(
 
 
 def _identity(features: object) -> Mapping[str, Any]:
-    """Return the identity of the encoder from the features in a manifest; {} if it is not recorded."""
+    """Return the identity of the text encoder from the manifest entry `features`; {} if it is not recorded."""
     identity = features.get("texts", features.get("encoder")) if isinstance(features, Mapping) else None
     return identity if isinstance(identity, Mapping) else {}
 
@@ -221,8 +224,8 @@ def own_words(field: HasManifest) -> tuple[str, ...]:
 def default_rule(field: HasManifest) -> DefaultRule:
     """Return the default rule, negatives and threshold of queries of a field.
 
-    The rule is contrast for a field with a null level, and otherwise the rule of the encoder. It is cosine if the
-    encoder is unknown, or if a file of text embeddings does not contain the encoder's default negatives.
+    The rule is contrast for a field with a null level. For other fields, it is the rule of the encoder, or cosine if
+    the encoder is unknown or a file of text embeddings does not contain the default negatives of the encoder.
     """
     if field.manifest.get("null_words") is not None:
         return _CONTRAST

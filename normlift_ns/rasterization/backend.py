@@ -28,7 +28,7 @@ class RasterJob:
     dtype: torch.dtype
     """Precision of the computation."""
     weight_power: int = 1
-    """Exponent p of the weights in the evidence, which sums A_ij ** p."""
+    """Exponent p of the weights. The evidence is the sum of A_ij ** p."""
 
     @cached_property
     def prepared(self) -> projection.AnyPrepared:

@@ -28,10 +28,10 @@ from normlift_ns.rasterization.settings import RasterSettings
 
 _CHANNELS = 32
 _COMPILED = ("frustum_margin", "min_compensation", "max_alpha", "min_alpha", "min_transmittance")
-"""Constants of gsplat's compiled code."""
+"""Constants of gsplat's compiled code that must equal those of the scene."""
 _EXTENT = ("per_axis", "radius_sigmas", "min_discriminant")
-"""Further constants of the compiled code. They may differ if the scene uses the squares of gsplat 1.4, because later
-versions support these too."""
+"""Further constants of the compiled code. They may differ from those of the scene if it uses the squares of gsplat 1.4,
+because later versions support these too."""
 _LARGE = 100.0
 """Scale in world units below which no determinant overflows, for focal lengths below 400,000 pixels."""
 _OVERFLOWS = 1e10
@@ -243,7 +243,7 @@ def _gradients(
 
 
 def compiled_rasterizer() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return gsplat's compiled forward and backward functions over pixels, whose names depend on the version."""
+    """Return gsplat's compiled forward and backward functions for pixels. Their names depend on the gsplat version."""
     from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
 
     name = "rasterize_to_pixels_3dgs" if hasattr(_C, "rasterize_to_pixels_3dgs_fwd") else "rasterize_to_pixels"

@@ -96,14 +96,15 @@ def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) ->
 
 
 _STRETCH = 0.1
-"""Relative growth of the covariance of a bounding ellipse, whose center differs from that of the bounded ellipse."""
+"""Fraction by which a covariance is enlarged, because a bounding ellipse has another center than the bounded one."""
 
 
 def _bounding_ellipses(projected: ProjectedGaussians2D, min_alpha: float) -> Float[Tensor, "m 3"]:
-    """Return conics in pixels, around `means2d`, of ellipses that contain every pixel with alpha >= min_alpha.
+    """Return ellipses around `means2d` that contain every pixel with alpha >= min_alpha, as conics in 1 / pixels^2.
 
-    Such a pixel lies in the projected ellipse of r standard deviations or in a disc with a radius of r / sqrt(2)
-    pixels. A conic is scaled so that r ** 2 bounds its ellipse; it is zero if the projection is not an ellipse.
+    Let r ** 2 = 2 log(opacity / min_alpha). Such a pixel lies in the projected ellipse of r standard deviations or in a
+    disc with a radius of r / sqrt(2) pixels. The ellipse contains the offsets x with x^T C x <= r ** 2, for its conic
+    C. A conic is zero if the projection is not an ellipse.
     """
     transforms, means = projected.transforms.double(), projected.means2d.double()
     square = (2 * (projected.opacities.double() / min_alpha).log()).clamp(min=0)

@@ -26,7 +26,7 @@ class PreparedGaussians(NamedTuple):
     """Drawable Gaussians of a scene with their covariances, for any camera."""
 
     gaussian: Int64[Tensor, " m"]
-    """Rows of the scene."""
+    """Indices of the Gaussians in the scene."""
     means: Float[Tensor, "m 3"]
     """Centers in the precision of the scene, because rounding would change the drawing order."""
     covariances: Float[Tensor, "m 3 3"]
@@ -37,10 +37,10 @@ class ProjectedGaussians(NamedTuple):
     """Visible Gaussians of one camera, nearest first."""
 
     gaussian: Int64[Tensor, " m"]
-    """Rows of the scene."""
+    """Indices of the Gaussians in the scene."""
     means2d: Float[Tensor, "m 2"]
     conics: Float[Tensor, "m 3"]
-    """Inverse covariance in square pixels: xx, xy, yy."""
+    """Entries xx, xy and yy of the inverse covariance, in 1 / pixels^2."""
     opacities: Float[Tensor, " m"]
     radii: Float[Tensor, "m 2"]
     """Half width and half height of the rectangle that selects tiles, in whole pixels."""
@@ -58,9 +58,9 @@ class PreparedGaussians2D(NamedTuple):
     """The drawable Gaussians of a scene of 2D Gaussian Splatting, prepared for any camera."""
 
     gaussian: Int64[Tensor, " m"]
-    """Rows of the scene."""
+    """Indices of the Gaussians in the scene."""
     means: Float[Tensor, "m 3"]
-    """Centers in the precision of the scene, which decides the drawing order."""
+    """Centers in the precision of the scene, because rounding would change the drawing order."""
     axes: Float64[Tensor, "m 3 2"]
     """The two axes in the plane of each Gaussian, as long as its standard deviations."""
     opacities: Float[Tensor, " m"]
@@ -70,14 +70,14 @@ class ProjectedGaussians2D(NamedTuple):
     """The Gaussians of 2D Gaussian Splatting visible in a camera, nearest first."""
 
     gaussian: Int64[Tensor, " m"]
-    """Rows of the scene."""
+    """Indices of the Gaussians in the scene."""
     means2d: Float[Tensor, "m 2"]
     """Centers of the projected ellipses of one standard deviation."""
     transforms: Float[Tensor, "m 3 3"]
     """Matrices from (a, b, 1), with a and b in standard deviations along the axes, to homogeneous pixels."""
     opacities: Float[Tensor, " m"]
     radii: Float[Tensor, "m 2"]
-    """Half width and height of the square that selects the tiles, in whole pixels."""
+    """Half width and half height of the square that selects the tiles, in whole pixels."""
 
     def exponents(
         self, members: Int64[Tensor, " k"], x: Float[Tensor, " w"], y: Float[Tensor, " h"]

@@ -415,7 +415,7 @@ class Contributors(NamedTuple):
 
     offsets: Int64[Tensor, " p_plus_1"]
     gaussian: Int64[Tensor, " m"]
-    """Rows of the scene."""
+    """Indices of the Gaussians in the scene."""
     weight: Float[Tensor, " m"]
     """Weights A_pj in 0..1. The weights of a pixel add up to its alpha."""
 

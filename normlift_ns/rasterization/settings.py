@@ -37,7 +37,8 @@ class RasterSettings:
     eps2d: float = 0.3
     """Blur that is added to the diagonal of the projected covariance, in square pixels."""
     frustum_margin: float = 0.3
-    """Margin around the image as a fraction of half the field of view. The Jacobian is constant outside this margin."""
+    """Margin around the image, as a fraction of half its width and half its height. For Gaussians beyond the margin,
+    the projection is linearized at the edge of the margin."""
     min_discriminant: float = 0.01
     """Lower bound of (trace / 2) ** 2 - det in the formula of the projected covariance's larger eigenvalue."""
     min_compensation: float = 0.0

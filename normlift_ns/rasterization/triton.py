@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float32
 from torch import Tensor
 
 from normlift_ns.core.evidence import Entries
-from normlift_ns.core.gaussians import Camera
+from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.sparse import sum_equal_keys
 from normlift_ns.errors import InputError
 from normlift_ns.kernels import compositing as kernel
 from normlift_ns.kernels.compositing import AlphaLimits, CellGrid, CellLists, build_cell_lists, decode_keys, sum_regions
-from normlift_ns.kernels.projection import ProjectedSplats, ProjectionSettings, project_gaussians
-from normlift_ns.kernels.projection_2dgs import Settings2D, project_gaussians_2d
+from normlift_ns.kernels.projection import SPLAT, ProjectedSplats, ProjectionSettings, project_gaussians
+from normlift_ns.kernels.projection_2dgs import SPLAT_2D, Settings2D, project_gaussians_2d
+from normlift_ns.options import RasterizeMode
 from normlift_ns.rasterization.backend import RasterBatch, RasterJob, check_gpu
 from normlift_ns.rasterization.settings import RasterSettings
 
@@ -27,10 +30,12 @@ With many Gaussians, smaller cells are faster, because the pixels of a cell have
 _MANY = 4_000_000
 """Smallest number of Gaussians for which `SMALL_CELL` is used."""
 _ELEMENTS, _MAX_VIEWS = 2**26, 16
-"""Largest number of views in a batch times Gaussians, and largest number of views in a batch.
+"""Limits of a batch: number of views times number of Gaussians, and number of views.
 
 A view takes one byte per Gaussian and 120 bytes per visible Gaussian.
 """
+_SAMPLE = 4096
+"""Number of Gaussians that `kernel_calls` projects."""
 _SHORT = 2**15
 """Largest number of cells in a batch that int16 can index. Sorting int16 takes half the time of int32."""
 
@@ -53,6 +58,12 @@ def project_and_bin(
         cameras: Cameras of one size.
         cull: As in `build_cell_lists`.
     """
+    grid, projected = _grid(job, cameras[0]), _project(job, cameras)
+    cull = cull and not job.is_2d
+    return grid, projected, build_cell_lists(projected, len(cameras), grid, job.settings.min_alpha, cull=cull)
+
+
+def _project(job: RasterJob, cameras: Sequence[Camera]) -> ProjectedSplats:
     scene, settings = job.scene, job.settings
     rows = [
         torch.cat([camera.world_to_camera[:3].flatten(), camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]]).float()
@@ -60,16 +71,12 @@ def project_and_bin(
     ]
     views = torch.stack(rows).to(scene.means.device)
     width, height = cameras[0].width, cameras[0].height
-    grid = _grid(job, cameras[0])
     inputs = (scene.means, scene.quats, scene.scales, scene.opacities, scene.drawable, views, width, height)
     if job.is_2d:
         rules = Settings2D(*(getattr(settings, name) for name in Settings2D._fields))
-        projected = project_gaussians_2d(*inputs, rules)
-    else:
-        rules = ProjectionSettings(*(getattr(settings, name) for name in ProjectionSettings._fields))
-        projected = project_gaussians(*inputs, rules, antialiased=job.antialiased, per_axis=settings.per_axis)
-    cull = cull and not job.is_2d
-    return grid, projected, build_cell_lists(projected, len(cameras), grid, settings.min_alpha, cull=cull)
+        return project_gaussians_2d(*inputs, rules)
+    rules = ProjectionSettings(*(getattr(settings, name) for name in ProjectionSettings._fields))
+    return project_gaussians(*inputs, rules, antialiased=job.antialiased, per_axis=settings.per_axis)
 
 
 def in_flight(job: RasterJob, camera: Camera) -> int:
@@ -113,6 +120,38 @@ def composite(
     return kernel.composite(
         projected.splats, lists, projected.keys, values.to(job.scene.means), grid, _limits(job.settings)
     )
+
+
+def kernel_calls(
+    scene: GaussianScene, camera: Camera, *, rasterize_mode: RasterizeMode, settings: RasterSettings,
+    dtype: torch.dtype, weight_power: int, **_: Any,
+) -> tuple[list[Callable[[], Any]], list[Callable[[], Any]]]:  # fmt: skip
+    """Return calls that each compile some kernels of this backend, with one splat or some Gaussians of a scene.
+
+    Returns:
+        Calls for the kernels of `composite`, and for the other kernels of `views_evidence`.
+    """
+    job = RasterJob(scene, rasterize_mode == "antialiased", settings, dtype, weight_power)
+    grid, device, limits = _grid(job, camera), scene.means.device, _limits(settings)
+    sample = replace(job, scene=scene.select(slice(_SAMPLE)))
+    splats = torch.ones(1, SPLAT_2D if job.is_2d else SPLAT, device=device)  # it covers the first pixels
+    row = torch.zeros(1, dtype=torch.int64, device=device)
+    projected = ProjectedSplats(row, splats, splats[0, :1])
+    offsets = torch.ones(grid.cells + 1, dtype=torch.int32, device=device)
+    offsets[0] = 0
+    lists = CellLists(offsets, row.int())
+    labels = torch.zeros(1, camera.height, camera.width, dtype=torch.int32, device=device)
+    columns = torch.tensor([0, 2], dtype=torch.int32, device=device)
+
+    def sum_labels() -> None:
+        sum_regions(splats, lists, labels, grid, columns=2, limits=limits, weight_power=weight_power)
+
+    rendering = [
+        lambda: _project(sample, [camera]),
+        lambda: build_cell_lists(projected, 1, grid, settings.min_alpha, cull=not job.is_2d),
+        lambda: kernel.composite(splats, lists, row, splats[:, :3].contiguous(), grid, limits),
+    ]
+    return rendering, [sum_labels, lambda: decode_keys(row.int(), row, columns, 2)]
 
 
 def _limits(settings: RasterSettings) -> AlphaLimits:

@@ -29,7 +29,7 @@ COLORMAPS: tuple[Colormap, ...] = get_args(Colormap)
 blindness.
 """
 RELIABILITY_COLORMAP: Colormap = "cividis"
-"""Colormap of R, always over the range 0 to 1."""
+"""Colormap of the reliability R, always over the range 0 to 1."""
 MIN_OVERLAY_OPACITY, MAX_OVERLAY_OPACITY = 0.35, 0.9
 """Opacity over the scene at the lowest and the highest selected relevancy."""
 _OKABE_ITO = ("e69f00", "56b4e9", "009e73", "f0e442", "0072b2", "d55e00", "cc79a7")

@@ -43,13 +43,13 @@ SEGMENTATION_OPACITY = 0.8
 class Display:
     """Scalars to render in addition to the colors, and their color scales.
 
-    The class is immutable because the viewer renders in other threads. Q is the number of prompts; without prompts,
-    nothing is selected.
+    The class is immutable because the viewer renders in other threads. Q is the number of prompts; it is
+    0 if there is no answer.
     """
 
     values: Float[Tensor, "n q_plus_5"]
-    """Columns: relevancy of each prompt, relevancy shown in the overlay, selected (0 or 1), selected by any prompt
-    (0 or 1), R, and N_eff."""
+    """Columns: relevancy of each prompt, relevancy shown in the overlay, selection in the overlay (0 or 1), selection
+    in the segmentation (0 or 1), reliability R, and effective number of views N_eff."""
     scale: tuple[float, float]
     """Relevancies of the first and the last color of the overlay."""
     map_scale: tuple[float, float]
@@ -233,10 +233,10 @@ def segmentation(
 def reliability_map(
     rgb: Float[Tensor, "h w 3"], reliability: Float[Tensor, "h w 1"], alpha: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """Return a map of R on a fixed scale from 0 to 1, with its legend.
+    """Return a map of the reliability R on a fixed scale from 0 to 1, with a legend.
 
     Args:
-        reliability: Composited R.
+        reliability: Composited reliability, not divided by `alpha`.
     """
     pixel = pixel_relevancy(reliability, alpha)[:, :, 0]
     color = colors.colormap_rgb(colors.RELIABILITY_COLORMAP).to(rgb)[(pixel.clamp(0, 1) * 255).round().long()]
@@ -429,8 +429,8 @@ CONTACT_SHEET_PREFIX = "contact_sheet"
 """Prefix of the file names of contact sheets; the prefix of other figures is the name of their view."""
 _THREADS = min(16, os.cpu_count() or 1)
 """Number of views whose figures are drawn and saved concurrently."""
-_ZLIB_LEVEL = 4
-"""Compression level of PNG files. A level of 6 takes twice as long for files that are 6% smaller."""
+_ZLIB_LEVEL = 1
+"""Compression level of PNG files. A level of 4 takes 1.4 times as long for files that are 4% smaller."""
 
 
 def save_overlays(
@@ -577,8 +577,8 @@ def save_inventory(
 ) -> str:
     """Write a PNG render of the scene with outlines, numbers and names of the objects of an inventory.
 
-    The camera is that of the training image that shows the most objects. Among several such images, it is the one with
-    the largest objects, each compared with its largest size in any image.
+    The camera is that of the training image that shows the most objects. If several images show as many, it is the one
+    in which the objects are largest on average, each as a fraction of its largest size in any image.
 
     Args:
         path: File to write.
@@ -642,8 +642,8 @@ def write_masks(
 ) -> list[Path]:
     """Write one PNG mask per training image, of the same size: 255 for pixels that show the selection, 0 for others.
 
-    If an error occurs, no file is written. Objects in front of the selection occlude it. The masks fit the undistorted
-    images of the training.
+    If an error occurs, no file is written. Objects in front of the selection occlude it. The masks match the
+    undistorted images that the training used.
 
     Args:
         invert: Write 0 for pixels that show the selection, and 255 for others.

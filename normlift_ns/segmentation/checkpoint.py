@@ -254,7 +254,7 @@ def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT
 
 
 def _title(kinds: Mapping[str, SamFamily]) -> str:
-    """Return the name of networks in messages."""
+    """Return the name that messages use for the networks `kinds`."""
     return "SAM" if kinds is POINT_PROMPT_FAMILIES else "SAM 3"
 
 

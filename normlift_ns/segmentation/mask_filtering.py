@@ -30,24 +30,24 @@ class Suppression:
     score: float = 0.7
     """Drop a mask if its score is not above this threshold. If this would drop all masks, the best three are kept."""
     outer: float = 0.5
-    """Upper bound (exclusive) on the fraction of the other mask that the mask covers."""
+    """Drop a mask inside a larger one only if it covers less than this fraction of the larger mask."""
     inner: float = 0.85
-    """Lower bound (inclusive) on the fraction of the mask that the other mask covers."""
+    """Drop a mask inside a larger one only if the larger mask covers at least this fraction of it."""
 
 
 class MaskMeasurements(NamedTuple):
     """Areas and boxes of masks."""
 
     inner: Int32[Tensor, " m"]
-    """Number of pixels with a logit above the offset."""
+    """Number of pixels with a logit above the offset in `measure_logits`."""
     outer: Int32[Tensor, " m"]
-    """Number of pixels with a logit above minus the offset."""
+    """Number of pixels with a logit above minus the offset in `measure_logits`."""
     boxes: Int64[Tensor, "m 4"]
     """Boxes of the pixels with a positive logit, in the format of `masks_to_boxes`."""
 
     @property
     def stability(self) -> Float[Tensor, " m"]:
-        """IoU of each mask at the two thresholds, or NaN if it is empty at both."""
+        """IoU of the masks that the two thresholds give, or NaN if both masks are empty."""
         return self.inner / self.outer
 
 
@@ -174,7 +174,7 @@ class _Runs(NamedTuple):
     piece: Int64[Tensor, " n"]
     """Number of the component of each run. Large components may share a number."""
     area: Int64[Tensor, " n"]
-    """Number of pixels of the component of each run if it is small, else an arbitrary number that is not small."""
+    """Number of pixels of the component that contains each run. It is exact only for small components."""
 
     def at(self, index: Tensor) -> _Runs:
         return _Runs(*(value[index] for value in self))
@@ -214,8 +214,8 @@ class _Grid(NamedTuple):
     def row_bounds(self, edges: Int64[Tensor, " e"], least: int) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
         """Return the first position of rows, and the position after their last pixel.
 
-        If a row has at least `least` pixels, components that contain a whole row are large. The result then has only
-        rows with edges and the rows above and below them. Otherwise, it has all rows.
+        If images are at least `least` pixels wide, components that contain a whole row are large. The result then has
+        only rows with edges and the rows above and below them. Otherwise, it has all rows.
         """
         near = torch.full((self.masks, self.height + 1), self.width < least, device=edges.device)
         near.view(-1)[edges // self.row] = True
@@ -233,7 +233,7 @@ class _Grid(NamedTuple):
 
 
 def _symmetric_difference(edges: Int64[Tensor, " e"], *others: Int64[Tensor, " n"]) -> Int64[Tensor, " f"]:
-    """Return the edges of the symmetric difference of two masks."""
+    """Return the edges of the symmetric difference of a mask and another one, whose edges are the arrays `others`."""
     positions, counts = torch.cat([edges, *others]).sort().values.unique_consecutive(return_counts=True)
     return positions[counts == 1]
 
@@ -268,8 +268,8 @@ def _components_by_torch(nodes: int, pairs: Int64[Tensor, "2 p"]) -> Int64[Tenso
     """Return the component of each node of a graph, on any device. The number of a component is its first node.
 
     Each node has a parent, which is initially the node itself. In each round, each edge selects the smaller of the
-    grandparents of its two nodes. It becomes the parent of both nodes and of their parents, unless another edge selects
-    a smaller one. The rounds end when no parent changes.
+    grandparents of its two nodes. This grandparent becomes the parent of both nodes and of their parents, unless
+    another edge selects a smaller one. The rounds end when no parent changes.
     """
     one, other = pairs
     parent = torch.arange(nodes, device=pairs.device)
@@ -293,6 +293,6 @@ def _in_largest(runs: _Runs, grid: _Grid) -> Bool[Tensor, " n"]:
 
 
 def _spans(first: Int64[Tensor, " n"], length: Int64[Tensor, " n"]) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
-    """Return the indices i and the values of ranges of `length[i]` consecutive numbers that start at `first[i]`."""
+    """Return the index i and the value of every number from first[i] to first[i] + length[i] - 1, for all i in turn."""
     owner = torch.repeat_interleave(length)
     return owner, torch.arange(len(owner), device=first.device) + (first - length.cumsum(0) + length)[owner]

@@ -217,7 +217,7 @@ def requested_regions(options: SourceOptions) -> str:
 _PACKAGES = {"sam": "transformers", "edges": "h5py"}
 """Optional packages that regions need."""
 _NEXT_ENCODER = {"color": ("imagenet", "object names"), "imagenet": ("open_clip", "words outside ImageNet")}
-"""Encoder to recommend if only the given one is on this machine, and its advantage."""
+"""Recommended encoder and its advantage, by the encoder that is selected automatically on this machine."""
 
 
 def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
@@ -229,7 +229,7 @@ def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
 def _preferred_regions(options: SourceOptions, device: str) -> list[str]:
     """Return the regions that "auto" can select for the encoder, in order of preference.
 
-    The result does not depend on the weights on this machine. On a CPU, it excludes SAM. It also excludes edges if the
+    The result does not depend on the weights on this machine. On a CPU, it excludes SAM, and also edges if the
     encoder can encode patches, but would encode each region as a crop. Twelve crops through CLIP take longer than all
     patches of an image (`python -m research.edges --clip`).
     """
@@ -257,7 +257,7 @@ def resolve_source(options: SourceOptions, device: str = "cpu") -> SourceOptions
 def describe_choice(options: SourceOptions, device: str) -> str | None:
     """Return one line with the automatic encoder and regions, and the command that downloads preferred weights.
 
-    Return None if neither the encoder nor the regions of a learned encoder are automatic.
+    Return None if features are imported, or if neither the encoder nor the regions of a learned encoder are automatic.
     """
     any_encoder, any_regions = options.encoder == "auto", requested_regions(options) == "auto"
     named = not any_encoder and not (any_regions and encoder_kind(options.encoder).learned)

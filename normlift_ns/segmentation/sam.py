@@ -1,8 +1,8 @@
 """Automatic masks of SAM, SAM 2, SAM 2.1 and HQ-SAM.
 
 Images are resized as in Pillow, first along rows and then along columns, with weights of 22 bits and sums rounded to 8
-bits. This integer arithmetic below 2^31 gives the same result on all devices. If an image is reduced in height and this
-is less work, Pillow 13 can start with the columns. Pixel values then differ by at most one.
+bits. This integer arithmetic below 2^31 gives the same result on all devices. If an image is reduced in height, Pillow
+13 can start with the columns to save work. Pixel values then differ by at most one.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def _per_head(attention: Any, projection: Any) -> Tensor:
 
 
 def _image_scores(keys: Tensor, positions: Tensor | None) -> Callable[[Tensor], Tensor]:
-    """Return a function that computes the products [P, K, N] of directions [P, K, C] and the positioned image.
+    """Return a function that computes the products [P, K, N] of vectors [P, K, C] and the image with its positions.
 
     Args:
         keys: Embedding of the image, [N, C] or [P, N, C].
@@ -231,11 +231,11 @@ class _Upscaling(NamedTuple):
     weights: tuple[Tensor, Tensor]
     """Matrices [4 O, C], which map a position with C channels to 2 x 2 positions with O channels in row-major order."""
     biases: tuple[Tensor, Tensor]
-    """Biases [O]."""
+    """Bias [O] of each convolution."""
     norm: _Norm
 
     def __call__(self, keys: Float[Tensor, "p n c"], mask_channels: Float[Tensor, "p m o"]) -> Float[Tensor, "p m y x"]:
-        """Return the products of the channels of each pixel and the channels of each mask."""
+        """Return logits, the scalar products of the upscaled channels of each pixel with the channels of each mask."""
         if can_use_triton(keys) and keys.dtype != torch.float32:
             from normlift_ns.kernels.sam import upscale_masks  # noqa: PLC0415 (needs Triton)
 
@@ -583,7 +583,7 @@ class _Candidates(NamedTuple):
     boxes: Int64[Tensor, "c 4"]
     """Boxes in the image, in the format of `masks_to_boxes`."""
     crop: Int64[Tensor, " c"]
-    """Index of the crop."""
+    """Index of the crop that the candidate was found in; 0 is the whole image."""
 
     def at(self, index: Tensor) -> _Candidates:
         return _Candidates(*(value[index] for value in self))

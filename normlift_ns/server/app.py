@@ -8,7 +8,6 @@ import ctypes
 import html
 import ipaddress
 import mimetypes
-import os
 import re
 import secrets
 import socket
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import anyio
+import torch
 import uvicorn
 from anyio import CapacityLimiter
 from starlette.applications import Starlette
@@ -60,7 +60,7 @@ _HEADER_TIMEOUT, _BODY_TIMEOUT, _KEEP_ALIVE = 10.0, 20.0, 20
 _MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
 _TRIM_INTERVAL = 2.0
 _QUICK_THREADS = 4
-_THREADS = max(2, (os.cpu_count() or 2) // 2)
+_THREADS = max(2, torch.get_num_threads() // 2)
 """Number of threads for queries, and of those for slower work such as explanations. Each thread uses several cores."""
 _HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY, "X-Content-Type-Options": "nosniff",
@@ -324,9 +324,17 @@ class WarmServer:
         return FileResponse(path, headers=headers)
 
     async def _list_runs(self, request: Request) -> Response:
-        runs = [await self.run_of(name) for name in self.runs.ids]
-        describe = partial(_describe_all, runs, read_only=self.options.read_only)
-        return JSONResponse({"runs": await self.in_thread(describe)})
+        """List the runs that can be opened. One run at a time is held, because all may exceed the memory limit."""
+        runs, errors = [], []
+        for name in self.runs.ids:
+            try:
+                describe = partial((await self.run_of(name)).describe, read_only=self.options.read_only)
+                runs.append(await self.in_thread(describe))
+            except (InputError, OSError) as error:
+                errors.append(error)
+        if len(runs) == 0 and len(errors) > 0:
+            raise errors[0]
+        return JSONResponse({"runs": runs})
 
     async def _geometry(self, request: Request) -> Response:
         run = await self.run_of(request.path_params["run"])
@@ -429,10 +437,6 @@ def _bind(host: str, port: int) -> socket.socket:
         else:
             return listener
     raise InputError(f"--port {port} and the 99 ports after it are in use. Choose another port.")
-
-
-def _describe_all(runs: Sequence[ServedRun], *, read_only: bool) -> list[dict[str, Any]]:
-    return [run.describe(read_only=read_only) for run in runs]
 
 
 async def _no_icon(request: Request) -> Response:

@@ -213,7 +213,12 @@ class RemoteRun:
 
     @check_arguments
     def features(self, start: int = 0, stop: int | None = None) -> Float[Tensor, "m d"]:
-        """Return the unit features of the Gaussians `start` to `stop` - 1 (default: all)."""
+        """Return the unit features of the Gaussians `start` to `stop` - 1 (default: all).
+
+        Raises:
+            ValueError: The range is not valid, or has more than 131,072 Gaussians.
+            OSError: The server does not respond.
+        """
         query = f"features?start={start}" + ("" if stop is None else f"&stop={stop}")
         return torch.from_numpy(np.load(io.BytesIO(self._get(self._path(query)))))
 
@@ -264,7 +269,13 @@ class RemoteRun:
 
     @check_arguments
     def save(self, answer: RemoteAnswer, *, replace: bool = True) -> str:
-        """Store the prompts of an answer in the run; needs the access token unless the server is local."""
+        """Store the prompts of an answer in the run, and return the number of stored prompts as text.
+
+        This needs the access token unless the server listens on localhost only.
+
+        Args:
+            replace: Replace the prompts that the run already stores, instead of adding new ones to them.
+        """
         return json.loads(self._post("save", {"question": answer.question, "replace": replace}))["stored"]
 
     @check_arguments

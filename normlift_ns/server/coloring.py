@@ -14,16 +14,16 @@ from normlift_ns.session.state import State
 
 ColorMode = Literal["overlay", "heat", "prompts", "reliability", "rgb", "pca"]
 """Coloring of the scene. overlay: selected Gaussians in the color of their best prompt, stronger for higher relevancy.
-prompts: the same at full strength. heat: relevancy of all Gaussians in a colormap. reliability: R from 0 to 1. rgb:
-trained colors. pca: three principal components of the features as RGB."""
+prompts: the same at full strength. heat: relevancy of all Gaussians in a colormap. reliability: R in a colormap from
+0 to 1. rgb: trained colors. pca: three principal components of the features as RGB."""
 COLOR_MODES: tuple[ColorMode, ...] = get_args(ColorMode)
 NOT_DRAWN = 255
-"""Code of Gaussians that are not drawn."""
+"""Code of Gaussians that are not drawn. All other codes are indices in the palette."""
 BY_HAND_COLOR: RGB = (1.0, 0.75, 0.1)
 _OWN, _GRAY = 0, 1
 """Codes of the trained color, and of its dimmed gray value."""
 _FIRST, _CODES = 2, 253
-"""First code for the colors of a mode, and the number of these codes."""
+"""First code for the colors of a color mode, and the number of codes for these colors."""
 _MIN_SHARE, _FULL_SHARE = 0.45, 0.85
 """Opacity of a prompt's color over gray, at the threshold and at the best match."""
 _MIN_SPAN = 0.05

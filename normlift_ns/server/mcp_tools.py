@@ -196,7 +196,7 @@ def _selection(prompts: list[str], number: int | None) -> schema.Selection:
 
 
 def _view_of(served: ServedRun, selection: schema.Selection) -> Any:
-    """Return a camera that looks at an object from a position without occlusion."""
+    """Return a camera that looks at an object from a position with little occlusion, if there is one."""
     state = schema.select_state(served, msgspec.structs.replace(selection, object=None))
     return served.view_of(schema.find_object(state, selection.object or 1), None, served.space.empty_mask() == 0)
 

@@ -141,7 +141,11 @@ class ServedRun:
 
     @cached_property
     def frame(self) -> tuple[list[float], list[float], float]:
-        """Mean up direction of the cameras, center of the scene, and a radius that contains 80 % of it."""
+        """Mean up direction of the cameras, center of the scene, and radius of the scene.
+
+        The center is the median position of the cameras and the drawn Gaussians. The cube around it whose half side is
+        the radius contains 80 % of them.
+        """
         poses = [camera.world_to_camera.double().cpu().numpy() for camera in self.run.scene.train.cameras]
         up = -np.mean([pose[1, :3] for pose in poses], axis=0) if len(poses) > 0 else np.zeros(3)
         up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
@@ -157,7 +161,7 @@ class ServedRun:
 
     @cached_property
     def first_view(self) -> PageView | None:
-        """Camera of the first training image, looking at the median depth of the scene; None without images."""
+        """Camera of the first training image, with a target at the median depth of the scene; None without images."""
         cameras = self.run.scene.train.cameras
         if len(cameras) == 0:
             return None
@@ -275,7 +279,7 @@ class ServedRun:
     def view_of(
         self, target: ObjectRow | LookAtTarget, view: PageView | None, drawn: Bool[torch.Tensor, " n"]
     ) -> PageView:
-        """Return a camera that looks at an object or a point from a position without occlusion.
+        """Return a camera that looks at an object or a point from a position with little occlusion, if there is one.
 
         Args:
             view: Current camera; None for that of the first training image.
@@ -336,13 +340,13 @@ class ServedRun:
 
     def warm_up(self) -> None:
         """Compute in advance the data that the first page needs."""
-        _ = self.geometry, self.examples, self.first_view, self.space.neighbor_pairs
+        _ = self.geometry, self.examples
         view = self.first_view
         if view is not None:
             codes = Codes([(0, 0, 0, 0.0, 0)], np.zeros(len(self.rows), np.uint8))
             self.still(codes, view.camera(64))  # compiles the renderer
             self.weights(view.position, np.subtract(view.look_at, view.position).tolist())
-        _ = self.pca
+        _ = self.space.neighbor_pairs, self.pca
 
     @property
     def in_use(self) -> bool:
@@ -417,6 +421,14 @@ class RunStore:
                     if sum(size for _, size in self._open.values()) > self._limit:
                         del self._open[other]
             return served
+
+    def warm_up(self) -> None:
+        """Compute in advance the data that the first page of each open run needs, one run after another."""
+        for name in self.ids:
+            with self._lock:
+                served, _ = self._open.get(name, (None, 0))
+            if served is not None:
+                served.warm_up()
 
 
 def _estimated_bytes(run: LiftedRun) -> int:

@@ -419,7 +419,7 @@ class PageSession:
         await self._tell(f"The run now stores {count}.", "done", pending.seq)
 
     async def _go_to(self, pending: _Pending) -> None:
-        """Move the camera close to an object or a position, without occlusion."""
+        """Move the camera close to an object or a position, with little occlusion if possible."""
         value = pending.value
         if value.id is None and value.position is None:
             raise InputError("The action go_to needs the id of an object or a position.")

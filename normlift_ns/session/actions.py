@@ -29,10 +29,11 @@ class PromptDiagnostics:
     color: RGB
     """Color of the prompt."""
     histogram: Histogram
-    """Histogram of its relevancies."""
+    """Histogram of the relevancies of the prompt."""
     warning: str
     """Warning about the prompt, or an empty string. If the encoder ignores some words, the warning lists those that it
-    uses. If the prompt is not found or selects no Gaussian, the warning describes the nearest match."""
+    uses. If the verdict is "weak match" or "probably not here", or no Gaussian is selected, it describes the nearest
+    match."""
     nearest_position: tuple[float, float, float] | None = None
     """Position of the nearest match, if there is a warning."""
 
@@ -82,6 +83,8 @@ def threshold_suggestion(state: State) -> float | None:
 def carry_threshold(state: State, question: Query) -> Query:
     """Return `question` with the threshold of the previous query, if both use the same rule.
 
+    A query of clicks alone does not pass its threshold to a query with texts, nor the reverse.
+
     If `question` uses the suggested threshold, it gets the previous threshold only if the user chose that threshold.
     """
     previous = state.query
@@ -105,7 +108,7 @@ def _only_clicks(question: Query) -> bool:
 
 
 ClickMode = Literal["select", "add", "remove"]
-"""Effect of a click: select the object at this position, add it to the selection, or remove it."""
+"""Effect of a click: select the object at the clicked position, add it to the selection, or remove it from there."""
 MAX_LAYERS = 32
 MAX_GROW_STEPS = 10
 """Maximum number of steps for growing or shrinking a selection."""
@@ -118,8 +121,8 @@ def ask(state: State, prompts: Sequence[Prompt], question: Query | None) -> Stat
     """Apply a new query. Hidden Gaussians stay hidden; clicked selections are dropped.
 
     Args:
-        prompts: All rows, from `build_query`.
-        question: Query of these rows, from `build_query`; None if no row has a vector, so that nothing is selected.
+        prompts: All prompts, from `build_query`.
+        question: Query of these prompts, from `build_query`; None if no prompt has a vector. Nothing is then selected.
     Raises:
         ValueError: The vectors have a different dimension than the field.
     """
@@ -336,7 +339,7 @@ def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
 
 
 def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
-    """Draw only these Gaussians, including hidden ones.
+    """Draw only these Gaussians, including hidden ones, but not those in hidden layers.
 
     Args:
         chosen: Mask of the Gaussians (default: the selection).
@@ -350,7 +353,7 @@ def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
 
 
 def show_all(state: State) -> State:
-    """Show all hidden Gaussians again."""
+    """Show all hidden Gaussians again, except those in hidden layers."""
     return state if state.hidden is None else replace(state, hidden=None, action="Show everything")
 
 

@@ -18,33 +18,33 @@ from normlift_ns.rendering.colors import RGB, prompt_rgb_tuples
 from normlift_ns.session.state import WEAK_RELIABILITY, State
 
 _STRONG = 0.8
-"""Minimum R of strong evidence."""
+"""Minimum reliability R of strong evidence."""
 _BY_HAND = "selected by hand"
 _BY_HAND_COLOR = (1.0, 0.75, 0.1)
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectRow:
-    """One object, a connected component of the Gaussians that one prompt selects."""
+    """One object, a connected component of the Gaussians that one prompt selects or that are selected by hand."""
 
     text: str
-    """The prompt."""
+    """The prompt, or "selected by hand"."""
     number: int
-    """Number of the object, 1 for the largest object of its prompt."""
+    """Number of the object, 1 for the largest object with the same text."""
     color: RGB
-    """Color of the prompt, RGB in 0..1."""
+    """Color of the prompt or of selections by hand, RGB in 0..1."""
     mask: Bool[Tensor, " n"]
     """Mask of the object's Gaussians."""
     size: int
     """Number of Gaussians."""
     reliability: float
-    """Mean R, weighted by the total evidence of each Gaussian."""
+    """Mean reliability R of the Gaussians, weighted by the total evidence of each."""
     mean_views: float
-    """Mean N_eff, weighted in the same way."""
+    """Mean effective number of views N_eff of the Gaussians, weighted by the total evidence of each."""
     center: tuple[float, float, float]
-    """Mean center, weighted in the same way; the camera looks at it."""
+    """Mean center of the Gaussians, weighted by the total evidence of each. The camera looks at this position."""
     extent: float
-    """Diagonal of the box around the central 90 % of the Gaussian centers."""
+    """Diagonal, in scene units, of the box around the central 90 % of the Gaussian centers along each axis."""
 
     @property
     def name(self) -> str:
@@ -53,7 +53,7 @@ class ObjectRow:
 
     @property
     def evidence(self) -> str:
-        """Strength of the evidence as text, with R and the number of views."""
+        """Strength of the evidence as text, with the reliability R and the effective number of views."""
         grade = "strong" if self.reliability >= _STRONG else "fair" if self.reliability >= WEAK_RELIABILITY else "weak"
         return f"{grade} evidence (R {self.reliability:.2f}, {self.mean_views:.1f} views)"
 
@@ -113,12 +113,12 @@ def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size
 Position = tuple[float, float, float]
 """x, y and z in scene units."""
 _MAX_OCCLUSION = 0.25
-"""Maximum mean opacity in front of the object for a clear view."""
+"""Largest mean opacity in front of an object at which the view of it counts as clear."""
 _FILL = 0.8
-"""Extent of the object as a fraction of the image height."""
+"""Fraction of the image height that an object fills if the camera faces it."""
 _SIGHT_POINTS = 8
 _AZIMUTHS, _ELEVATIONS = (0, 45, -45, 90, -90, 135, -135, 180), (0, 35)
-"""Angles in degrees around the vertical and above the current height."""
+"""Angles in degrees of the candidate camera positions, around the vertical and above the current height."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def unoccluded_viewpoint(
 def viewpoint(
     target: ObjectRow | LookAtTarget, camera_position: Sequence[float] | np.ndarray, field_of_view: float = 0.9
 ) -> Position:
-    """Return a camera position on the current side of an object, at a distance at which the object fills the image.
+    """Return a camera position on the current side of an object, from which it fills 80 % of the image height.
 
     Args:
         target: Object or point to look at.

@@ -59,12 +59,12 @@ def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any
     """Encode a line of prompts. If a prompt cannot be encoded, its row has the error message of the encoder.
 
     Args:
-        text: prompts as the user typed them.
-        read: encoder of texts.
-        known_vectors: vectors of clicks and of prompts stored in the run, by text; they need no encoder.
+        text: Prompts as the user typed them.
+        read: Encoder of texts.
+        known_vectors: Vectors of clicks and of prompts stored in the run, by text; they need no encoder.
     Raises:
-        ValueError: the text has no prompts, or more than `MAX_PROMPTS`.
-        OSError, MemoryError: the encoder cannot be loaded.
+        ValueError: The text has no prompts, or more than `MAX_PROMPTS`.
+        OSError, MemoryError: The encoder cannot be loaded.
     """
     texts, vectors = split_prompts(text), dict(known_vectors or {})
     if len(texts) == 0:
@@ -114,11 +114,11 @@ def build_query(
     clicked Gaussian is in the scene. A query of clicks and texts requires the rule cosine.
 
     Args:
-        read: encoder of the negatives. The other arguments are those of `make_query`.
+        read: Encoder of the negatives. The other arguments are those of `make_query`.
     Returns:
         The rows, with an error for each click if the rule is not cosine, and their query.
     Raises:
-        ValueError: no row has a vector, or an argument is not valid (see `make_query`).
+        ValueError: No row has a vector, or an argument is not valid (see `make_query`).
     """
     rows = tuple(prompts)
     clicks = [prompt.is_click for prompt in rows if prompt.vector is not None]
@@ -157,10 +157,10 @@ def merge_queries(stored: Query | None, asked: Query) -> Query:
     """Merge stored and new prompts into one query; a new prompt replaces a stored prompt with the same text.
 
     Args:
-        stored: query stored in the run; None if it has none.
-        asked: query to add.
+        stored: Query stored in the run; None if it has none.
+        asked: Query to add.
     Raises:
-        ValueError: the queries differ in rule, negatives or features.
+        ValueError: The queries differ in rule, negatives or features.
     """
     if stored is None:
         return asked

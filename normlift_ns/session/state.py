@@ -39,9 +39,9 @@ class State:
 
     space: SelectionContext
     prompts: tuple[Prompt, ...] = ()
-    """All rows, including those with errors."""
+    """All prompts, including those with errors."""
     query: Query | None = None
-    """Query of the rows without errors, with the threshold and the minimum reliability."""
+    """Query of the prompts without errors, with the threshold and the minimum reliability."""
     shown: int | None = None
     """Index of the only prompt that selects; None if all prompts of the query select."""
     prompts_select: bool = True
@@ -152,7 +152,7 @@ class History(Generic[T]):
 
     @staticmethod
     def of(state: T, *, lean: Callable[[T], T] = lambda state: state) -> History[T]:
-        """Return a history with a single state; `lean` is its `compact`."""
+        """Return a history with a single state, and with `lean` as its function `compact`."""
         return History((state,), compact=lean)
 
     @property

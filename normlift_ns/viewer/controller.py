@@ -157,7 +157,7 @@ class Controller(ABC):
 
     @abstractmethod
     def _find_floaters(self) -> Bool[Tensor, " n"]:
-        """Return the mask of likely floaters, which takes seconds."""
+        """Return the mask of likely floaters. This takes seconds."""
 
     @abstractmethod
     def _wait_for_click(self, action: Action, value: Any, client: Any) -> None:
@@ -283,7 +283,7 @@ class Controller(ABC):
                     self._do(state, message, answered=True)
 
     def _explain(self) -> None:
-        """Explain the selection by training images, which are found without the lock."""
+        """Explain the selection by training images. The search for these images runs without the lock."""
         state, reasons = self.history.now, self._reasons
         token = reasons.start(state)
         self.show_message("")

@@ -59,14 +59,14 @@ class Action(Enum):
 
 
 Act = Callable[[Action, Any, Any], None]
-"""Function of an action, its value and the browser that sent it."""
+"""Function of an action, the value of the action, and the browser that sent the action."""
 SLIDERS = (Action.THRESHOLD, Action.RELIABILITY, Action.GROW)
 """Actions of sliders, whose successive calls are merged into one step of the history."""
 ALL_PROMPTS = "all prompts"
 
 
 class ActionWidgets:
-    """Base class for widgets that send actions; a subclass creates the widgets named here.
+    """Base class for widgets that send actions; a subclass creates the widgets that this class declares.
 
     Args:
         gui: viser's `GuiApi`.
@@ -112,7 +112,7 @@ class ActionWidgets:
             self.reasons.content = explanation.content
 
     def reset_reliability(self) -> None:
-        """Reset the minimum reliability, which applies to the next query."""
+        """Reset the minimum reliability of the next query to 0."""
         self._reset(Action.RELIABILITY, self.reliability, 0.0)
 
     def _button(self, action: Action, label: str = "", *, hint: str | None = None, color: Any = None) -> Any:
@@ -143,7 +143,7 @@ class ActionWidgets:
         return widget
 
     def _set(self, action: Action, widget: Any, value: Any) -> None:
-        """Set a widget without calling `act`, unless `act` has not yet received the user's last change."""
+        """Set a widget without calling `act`. Keep a change of the user that `act` has not received yet."""
         if widget.value == self._values[action]:
             self._reset(action, widget, value)
 
@@ -333,7 +333,7 @@ def _image(media_type: str, content: bytes) -> str:
 
 
 MAX_EXPLAIN_IMAGES = 3
-"""Maximum number of images with the largest weight, and of images with the largest disagreement."""
+"""Maximum number of images with the largest weight, and of images with the largest disagreement, in an explanation."""
 _BUSY = "Finding supporting images …"
 _explain_lock = Lock()
 """Lock for reading and caching votes, so that no two threads do it at the same time."""
@@ -380,7 +380,7 @@ class Explanation:
     """Explanation of the current selection of one user.
 
     Args:
-        votes: Function that returns the votes of the run; it is called at the first explanation.
+        votes: Function that returns the votes of the run. Each explanation calls it, so it should cache its result.
     """
 
     def __init__(self, votes: Callable[[], RecordedVotes]) -> None:

@@ -1,5 +1,7 @@
 """Votes for a selection against sums in float64, and identities that they keep."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, InputError
-from normlift_ns.analysis.explain import Why, draw_outlines, explain_selection
+from normlift_ns.analysis.explain import RecordedVotes, Why, draw_outlines, explain_selection
 from normlift_ns.core.evidence import Entries
 from tests.examples import examples
 from tests.random_scenes import generator, unit_rows
@@ -120,6 +122,14 @@ def test_selections_of_nothing_or_of_another_shape():
     ):
         with pytest.raises(InputError, match=hint):
             explain_selection(evidence, features, wrong)
+
+
+def test_without_cached_evidence_no_regions_are_computed(tmp_path):
+    field = SimpleNamespace(store=None, manifest={"views_lifted": []})
+    votes = RecordedVotes(None, field, tmp_path)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="evidence"):
+        _ = votes.table
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_outline_lies_within_and_around_its_region():

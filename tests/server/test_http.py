@@ -99,6 +99,8 @@ def test_geometry_images_and_the_description_of_the_api(served_room, client):
     facts = remote.info
     assert facts["num_drawn"] + facts["num_left_out"] <= facts["num_gaussians"] == len(run.field)
     assert set(facts["saved_prompts"]) == {"red", "yellow"} and len(facts["examples"]) > 0
+    assert set(facts["examples"]) < {"red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black",
+                                     "white", "gray"}  # fmt: skip
     first = client.get(f"{RUN}/geometry")
     assert first.headers["cache-control"] == "private, no-cache"
     tag = first.headers["etag"]
@@ -269,6 +271,27 @@ def test_runs_are_closed_when_memory_is_scarce_but_not_those_with_pages(tmp_path
     with pytest.raises(InputError, match="fox-one, castle-one"):
         store.get("other")
     assert isinstance(first.space.field, SemanticField)
+
+
+def test_runs_that_cannot_be_opened_are_not_listed(tmp_path, monkeypatch):
+    warm = []
+
+    def open_one(config):
+        if config.parts[-4] in broken:
+            raise InputError(f"{config} is missing")
+        return make_served(tmp_path).run
+
+    monkeypatch.setattr(runs_module, "_estimated_bytes", lambda run: 10)
+    monkeypatch.setattr(runs_module.ServedRun, "warm_up", lambda served: warm.append(served.id))
+    configs = [tmp_path / name / "normlift" / "one" / "config.yml" for name in ("fox", "castle", "room")]
+    broken, store = {"fox", "castle", "room"}, RunStore(configs, open_one, memory_limit=5)
+    with client_of(WarmServer(store, ServerOptions())) as client:
+        answer = client.get("/api/runs")
+        assert answer.status_code == 400 and answer.json()["error"] == "config.yml is missing"
+        broken -= {"fox", "room"}
+        assert [run["id"] for run in client.get("/api/runs").json()["runs"]] == ["fox-one", "room-one"]
+    store.warm_up()
+    assert warm == ["room-one"]  # fox-one does not fit into the memory
 
 
 def test_a_request_that_does_not_arrive_in_time_is_closed(tmp_path, monkeypatch):
