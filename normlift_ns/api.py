@@ -286,7 +286,7 @@ def check_alignment(prepared: PreparedLift, stages: StageTimer, wait_for_renderi
     """Report the warning of `compare_with_images`, unless the request disables the comparison.
 
     Args:
-        wait_for_rendering: Function that waits for the kernels of renders.
+        wait_for_rendering: Function that waits until the kernels for renders are compiled.
     """
     if not prepared.request.check_alignment:
         return

@@ -143,7 +143,10 @@ class EvidenceCollection:
         return downscaled_source(source, self.options.lift_downscale)
 
     def start_preparing_regions(self) -> None:
-        """Load what segments images in the background. Errors are suppressed, because the first image raises them."""
+        """Load the segmentation method in a background thread.
+
+        Errors are suppressed, because the first image raises them again.
+        """
         prepare = getattr(getattr(self._cached_source, "regions", None), "prepare", None)
 
         if prepare is None:
@@ -160,7 +163,7 @@ class EvidenceCollection:
 
         Args:
             stages: Timer of the lift, which reports progress.
-            kernels: Kernels that are compiled meanwhile.
+            kernels: Kernels that are being compiled in the background.
         """
         parts = [self.collect_chunk(chunk, stages, kernels) for chunk in chunk_views(self.views)]
         with stages("evidence", len(self.views)):

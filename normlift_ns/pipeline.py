@@ -554,7 +554,8 @@ def lift_calls(
     """Return calls that run stages of a lift on some Gaussians and discard the results, to compile their kernels.
 
     Returns:
-        Calls for consensus and neighbors, and a function that returns those for lift and vote of a feature dimension.
+        Calls for the consensus and the neighbors, and a function that returns the calls for the lift and the vote,
+        given the dimension of the features.
     """
     means, regions = means[:_WARM_UP_GAUSSIANS], _WARM_UP_REGIONS
     n, device = len(means), means.device

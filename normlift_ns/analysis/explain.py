@@ -386,8 +386,10 @@ class RecordedVotes:
 
     @property
     def disagreement(self) -> float:
-        """Usual disagreement of the views about a Gaussian: 1 - median ||f_j||, the mean of before and after the
-        consensus.
+        """Usual disagreement of the views about a Gaussian, 1 - median ||f_j||.
+
+        It is the mean of the values before and after the consensus, or the value after the consensus if the other one
+        is unknown.
         """
         scalars = self.field.scalars
         if not bool((scalars.norm > 0).any()):

@@ -97,7 +97,7 @@ _triton_lock = Lock()
 
 
 def load_triton() -> None:
-    """Load what all kernels of Triton need, once in this process: a hash of Triton's files and its driver.
+    """Load the hash of Triton's files and the driver, which all kernels of Triton need, once in this process.
 
     Without the lock, every thread that compiles a kernel would compute the hash and compile the driver. Errors are
     ignored here. They occur again in the first kernel.

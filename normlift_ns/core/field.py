@@ -39,7 +39,10 @@ from normlift_ns.io.run_dir import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, wr
 from normlift_ns.options import RelevancyRule, Storage
 
 CHANGED_COSINE = 0.98
-"""Cosine of the directions before and after the vote below which a Gaussian counts as changed, about 11 degrees."""
+"""Limit on the cosine between the directions of a Gaussian before and after the vote, about 11 degrees.
+
+Below the limit, the Gaussian counts as changed.
+"""
 
 
 @check_arguments
