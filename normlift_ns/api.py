@@ -103,29 +103,29 @@ def lift_run(
 
     Args:
         config_or_scene: config.yml of the trained run, or a scene from `open_scene` or `open_splat`.
-        source: options of the 2D features to compute from the images. If None, use the defaults of ns-normlift.
-        features: your own features, instead of `source`. Each training image has a pair of a label map [H, W] and
+        source: Options of the 2D features to compute from the images. If None, use the defaults of ns-normlift.
+        features: Your own features, instead of `source`. Each training image has a pair of a label map [H, W] and
             vectors [R, D]. The label map has the size of the undistorted image, before or after `lift_downscale`. Its
             values are regions 0..R-1, or -1 for no region. Pass a list with one pair per training image, or a
             dictionary by image name, which may omit images.
-        texts: vector [D] of each prompt, for your own features. The run stores the vectors for later queries.
-        lift: options of the lift. If None, use the defaults.
-        queries: prompts to store in the run; ns-render and ns-viewer show their relevancy.
-        data: as in `open_scene`; allowed only with a config.
-        load_step: as in `open_scene`; allowed only with a config.
-        output_dir: output folder, instead of the outputs folder of the trained run.
-        timestamp: name of the new run directory. If None, use the current time, with a number if such a run exists.
-        overwrite: replace an existing run directory of that name, and exported files whose content differs.
-        check_alignment: compare three training images with renders of the scene before the lift. Warn if they differ,
+        texts: Vector [D] of each prompt, for your own features. The run stores the vectors for later queries.
+        lift: Options of the lift. If None, use the defaults.
+        queries: Prompts to store in the run; ns-render and ns-viewer show their relevancy.
+        data: As in `open_scene`; allowed only with a config.
+        load_step: As in `open_scene`; allowed only with a config.
+        output_dir: Output folder, instead of the outputs folder of the trained run.
+        timestamp: Name of the new run directory. If None, use the current time, with a number if such a run exists.
+        overwrite: Replace an existing run directory of that name, and exported files whose content differs.
+        check_alignment: Compare three training images with renders of the scene before the lift. Warn if they differ,
             and raise if they do not show the same scene.
-        device: auto, cpu or cuda.
-        export: folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
-        report: progress callback, called with (stage, steps done, total steps).
-        say: callback for status lines and warnings, such as `print`.
+        device: Device to lift on: auto, cpu or cuda.
+        export: Folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
+        report: Progress callback, called with (stage, steps done, total steps).
+        say: Callback for status lines and warnings, such as `print`.
     Raises:
-        FileExistsError: the run directory exists and `overwrite` is False.
-        FileNotFoundError, ValueError: as in `open_scene`; also if an image, a label map or an option is not valid.
-        MemoryError: the lift does not fit into GPU memory.
+        FileExistsError: The run directory exists and `overwrite` is False.
+        FileNotFoundError, ValueError: As in `open_scene`; also if an image, a label map or an option is not valid.
+        MemoryError: The lift does not fit into GPU memory.
         TypeError: `config_or_scene` is neither a config nor a scene from `open_scene` or `open_splat`.
 
     >>> scene = open_scene(config)
@@ -286,7 +286,7 @@ def check_alignment(prepared: PreparedLift, stages: StageTimer, wait_for_renderi
     """Report the warning of `compare_with_images`, unless the request disables the comparison.
 
     Args:
-        wait_for_rendering: function that waits for the kernels of renders.
+        wait_for_rendering: Function that waits until the kernels for renders are compiled.
     """
     if not prepared.request.check_alignment:
         return
@@ -326,7 +326,7 @@ def query_to_store(
     """Return the query that a new run stores for these prompts; None without prompts.
 
     Raises:
-        ValueError: the vectors of the prompts and the features have different dimensions.
+        ValueError: The vectors of the prompts and the features have different dimensions.
     """
     if len(queries) == 0:
         return None
@@ -362,15 +362,15 @@ def write_run(
     directory in which the source run was trained. The ns-normlift commands run in any directory.
 
     Args:
-        run_dir: directory from `run_directory`, output_dir/experiment/normlift/timestamp.
-        question: query to store, which nerfstudio renders as relevancy_0, relevancy_1, …
-        text_embeddings: the user's own text embeddings, by prompt.
-        overwrite: replace an existing directory.
-        exact_name: if False and `run_dir` exists, write to <name>_2, <name>_3, … instead.
+        run_dir: Directory from `run_directory`, output_dir/experiment/normlift/timestamp.
+        question: Query to store, which nerfstudio renders as relevancy_0, relevancy_1, …
+        text_embeddings: The user's own text embeddings, by prompt.
+        overwrite: Replace an existing directory.
+        exact_name: If False and `run_dir` exists, write to <name>_2, <name>_3, … instead.
     Raises:
-        FileExistsError: the directory exists, `exact_name` is True and `overwrite` is False.
-        ValueError: the field was lifted from other Gaussians.
-        OSError: a file cannot be written, for instance because the disk is full. No files remain in that case.
+        FileExistsError: The directory exists, `exact_name` is True and `overwrite` is False.
+        ValueError: The field was lifted from other Gaussians.
+        OSError: A file cannot be written, for instance because the disk is full. No files remain in that case.
     """
     complete_interrupted_lifts(run_dir)
     if exact_name:

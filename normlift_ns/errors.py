@@ -55,8 +55,8 @@ def escape_unprintable(text: str, keep: str = "") -> str:
     r"""Escape unprintable characters, which could move the cursor, hide text or reverse it.
 
     Args:
-        text: untrusted text, such as a prompt or a path.
-        keep: unprintable characters to keep, for example a line break.
+        text: Untrusted text, such as a prompt or a path.
+        keep: Unprintable characters to keep, for example a line break.
 
     >>> print(escape_unprintable("red\x1b[31m mug\n"))
     red\x1b[31m mug\n

@@ -143,7 +143,10 @@ class EvidenceCollection:
         return downscaled_source(source, self.options.lift_downscale)
 
     def start_preparing_regions(self) -> None:
-        """Load what segments images in the background. Errors are suppressed, because the first image raises them."""
+        """Load the segmentation method in a background thread.
+
+        Errors are suppressed, because the first image raises them again.
+        """
         prepare = getattr(getattr(self._cached_source, "regions", None), "prepare", None)
 
         if prepare is None:
@@ -159,8 +162,8 @@ class EvidenceCollection:
         """Collect evidence, features and levels from all views.
 
         Args:
-            stages: timer of the lift, which reports progress.
-            kernels: kernels that are compiled meanwhile.
+            stages: Timer of the lift, which reports progress.
+            kernels: Kernels that are being compiled in the background.
         """
         parts = [self.collect_chunk(chunk, stages, kernels) for chunk in chunk_views(self.views)]
         with stages("evidence", len(self.views)):
@@ -251,12 +254,12 @@ def observe_views(
     """Compute labels and features of some training views.
 
     Args:
-        render_settings: rasterization rules for renders of the trained scene, which replace the images. If None, use
+        render_settings: Rasterization rules for renders of the trained scene, which replace the images. If None, use
             the images.
-        downscale: divisor of the size of images and cameras.
-        on_view: called after every view, with the view that the source received.
+        downscale: Divisor of the size of images and cameras.
+        on_view: Called after every view, with the view that the source received.
     Raises:
-        ValueError, FileNotFoundError: as in `FeatureSource.view` and `check_undistorted`; also if an image, a mask or
+        ValueError, FileNotFoundError: As in `FeatureSource.view` and `check_undistorted`; also if an image, a mask or
             a label map differs in size from its camera.
     """
     source = undistorting_source(downscaled_source(source, downscale), label_undistortion(scene.train))
@@ -412,9 +415,9 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     therefore show the distorted image, so the function accepts only maps of exactly the undistorted size.
 
     Args:
-        views: the same view at every size that the label map may have.
+        views: The same view at every size that the label map may have.
     Raises:
-        ValueError: the map has the wrong size. If the source resamples maps, the function warns instead.
+        ValueError: The map has the wrong size. If the source resamples maps, the function warns instead.
     """
     original_size, name = views[0].original, views[0].name
     maps = source.regions if isinstance(source, RegionFeatures) else source
@@ -459,12 +462,12 @@ def cache_views(evidence: Evidence, folder: Path, keys: Sequence[str]) -> None:
     """Write the evidence of views to a file in a folder.
 
     Args:
-        evidence: evidence of the views.
-        folder: folder of the cache.
-        keys: digest of the inputs of each view, in the order of the views.
+        evidence: Evidence of the views.
+        folder: Folder of the cache.
+        keys: Digest of the inputs of each view, in the order of the views.
 
     Raises:
-        OSError: the file cannot be written, for instance because the disk is full.
+        OSError: The file cannot be written, for instance because the disk is full.
     """
     path = _cache_path(folder, keys)
     evidence.save(path, key=path.stem, remarks={_VIEWS: " ".join(keys)}, own=True)

@@ -114,7 +114,7 @@ class LiftedRun:
         """Text encoder that matches the field. It loads its network on first use.
 
         Raises:
-            ValueError, FileNotFoundError: as in `text_encoder_for`.
+            ValueError, FileNotFoundError: As in `text_encoder_for`.
         """
         return text_encoder_for(self.field, self.device, text_cache_folder(self.folder))
 
@@ -133,19 +133,19 @@ class LiftedRun:
         """Compute the relevancy and the selection of every Gaussian for each prompt.
 
         Args:
-            texts: prompts for the text encoder of the run.
-            vectors: vectors [D] of further prompts by name, in the space of the features. They may have any norm > 0,
+            texts: Prompts for the text encoder of the run.
+            vectors: Vectors [D] of further prompts by name, in the space of the features. They may have any norm > 0,
                 and need no text encoder unless the rule compares with negatives.
-            negatives: negative prompts to compare with. If None, use those of the encoder.
-            relevancy: formula that computes relevancy from cosines; see `normlift_ns.relevancy`. "auto" is contrast if
+            negatives: Negative prompts to compare with. If None, use those of the encoder.
+            relevancy: Formula that computes relevancy from cosines; see `normlift_ns.relevancy`. "auto" is contrast if
                 the lift compared the scene with unrelated words, else lerf with negatives, else cosine.
-            threshold: relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
+            threshold: Relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
                 relevancies. None means 0.02 for the rule margin, "auto" for the rule cosine with encoders other than
                 "color", and otherwise 0.5.
-            min_reliability: minimum reliability R of selected Gaussians, in 0..1.
-            refined: use the directions after the vote.
+            min_reliability: Minimum reliability R of selected Gaussians, in 0..1.
+            refined: Use the directions after the vote.
         Raises:
-            ValueError: there is no prompt, a prompt is empty, the encoder cannot encode a prompt, or a vector has
+            ValueError: There is no prompt, a prompt is empty, the encoder cannot encode a prompt, or a vector has
                 another number of values than the features.
 
         >>> from normlift_ns import open_run
@@ -196,7 +196,7 @@ class LiftedRun:
         ns-render and ns-viewer then show the relevancy of its prompts.
 
         Raises:
-            ValueError: the vectors of the query and the directions of the field have different dimensions.
+            ValueError: The vectors of the query and the directions of the field have different dimensions.
         """
         question = question.question if isinstance(question, Answer) else question
         if question.embeddings.shape[1] != self.field.dimension:
@@ -226,20 +226,20 @@ class LiftedRun:
         contain reliabilities, relevancies and labels.
 
         Args:
-            path: file to write. Names that end with .glb, .spz or .compressed.ply select these formats, and all other
+            path: File to write. Names that end with .glb, .spz or .compressed.ply select these formats, and all other
                 names select PLY.
-            part: answer or finding that selects the Gaussians, or a mask of Gaussians. If None, write the whole scene.
-            answer: answer that provides relevancies, class_id and instance_id. If None, use the answer of `part`, if
+            part: Answer or finding that selects the Gaussians, or a mask of Gaussians. If None, write the whole scene.
+            answer: Answer that provides relevancies, class_id and instance_id. If None, use the answer of `part`, if
                 there is one.
-            objects: table to write to <stem>_objects.json, with JSON types only.
-            object_max_gap: maximum gap between Gaussians of one object, as in `find_objects`.
-            object_min_gaussians: minimum number of Gaussians in an object, as in `find_objects`.
-            overwrite: replace files of these names. Without `objects`, also remove an earlier table of objects.
+            objects: Table to write to <stem>_objects.json, with JSON types only.
+            object_max_gap: Maximum gap between Gaussians of one object, as in `find_objects`.
+            object_min_gaussians: Minimum number of Gaussians in an object, as in `find_objects`.
+            overwrite: Replace files of these names. Without `objects`, also remove an earlier table of objects.
         Returns:
             The row indices of the written Gaussians, in the order of the file.
         Raises:
-            FileExistsError: a file exists and `overwrite` is False.
-            ValueError: all Gaussians of `part` are invisible, or the mask has the wrong type or length. Also if the
+            FileExistsError: A file exists and `overwrite` is False.
+            ValueError: All Gaussians of `part` are invisible, or the mask has the wrong type or length. Also if the
                 name is reserved for files of a run, or the options of objects are given without an answer.
         """
         path = check_path("path", path)
@@ -279,13 +279,13 @@ class LiftedRun:
         The masks fit the images after the undistortion of the training.
 
         Args:
-            folder: folder to write to.
-            part: answer or finding that selects the Gaussians, or a mask of Gaussians.
-            rest: invert the masks. Pixels without any Gaussian are then 255 as well.
-            overwrite: replace files of these names.
+            folder: Folder to write to.
+            part: Answer or finding that selects the Gaussians, or a mask of Gaussians.
+            rest: Invert the masks. Pixels without any Gaussian are then 255 as well.
+            overwrite: Replace files of these names.
         Raises:
-            FileExistsError: a file exists and `overwrite` is False.
-            ValueError: the mask has the wrong type or length.
+            FileExistsError: A file exists and `overwrite` is False.
+            ValueError: The mask has the wrong type or length.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -314,15 +314,15 @@ class LiftedRun:
         Args:
             cloud: PLY file to read.
             path: PLY file to write.
-            part: answer that provides the labels, or a finding of that answer.
-            transfer_distance: maximum distance from a point to the center of its Gaussian, in units of the median
+            part: Answer that provides the labels, or a finding of that answer.
+            transfer_distance: Maximum distance from a point to the center of its Gaussian, in units of the median
                 spacing of the Gaussians.
-            coordinates: coordinate system of the cloud. "capture" is the system of the cameras before nerfstudio
+            coordinates: Coordinate system of the cloud. "capture" is the system of the cameras before nerfstudio
                 rotated and scaled them, and "scene" that of the Gaussians.
-            overwrite: replace a file of that name.
+            overwrite: Replace a file of that name.
         Raises:
-            FileNotFoundError: the cloud does not exist.
-            FileExistsError: a file exists and `overwrite` is False.
+            FileNotFoundError: The cloud does not exist.
+            FileExistsError: A file exists and `overwrite` is False.
             ValueError: `part` has no answer, the cloud is not a PLY file or already has properties of these names, or
                 the distance is not positive.
 
@@ -362,12 +362,12 @@ class LiftedRun:
         """Explain a selection by the images and regions that voted for it, and by their agreement.
 
         Args:
-            part: answer or finding that selects the Gaussians, or a mask of Gaussians. A mask is explained with the
+            part: Answer or finding that selects the Gaussians, or a mask of Gaussians. A mask is explained with the
                 refined directions.
         Raises:
-            ValueError: the selection is empty, or the mask has the wrong type or length. Also if the run stores only
+            ValueError: The selection is empty, or the mask has the wrong type or length. Also if the run stores only
                 directions, and its cache no longer has the evidence or the features.
-            FileNotFoundError: the run stores only directions, and an image is missing.
+            FileNotFoundError: The run stores only directions, and an image is missing.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -391,14 +391,14 @@ class LiftedRun:
         docs/objects.md explains every value.
 
         Args:
-            part: answer or finding that selects the Gaussians, or a mask of Gaussians. Objects of a mask have no text.
+            part: Answer or finding that selects the Gaussians, or a mask of Gaussians. Objects of a mask have no text.
                 A Gaussian that several prompts select belongs to the prompt with the largest relevancy.
-            meters_per_unit: length of one unit of the capture in meters. If given, positions in the capture are in
+            meters_per_unit: Length of one unit of the capture in meters. If given, positions in the capture are in
                 meters.
         Raises:
-            ValueError: the mask has the wrong type or length, `meters_per_unit` is not positive, or
+            ValueError: The mask has the wrong type or length, `meters_per_unit` is not positive, or
                 dataparser_transforms.json is damaged.
-            FileNotFoundError: the run has no dataparser_transforms.json.
+            FileNotFoundError: The run has no dataparser_transforms.json.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -425,13 +425,13 @@ class LiftedRun:
         called "object 1", "object 2" and so on.
 
         Args:
-            vocabulary: candidate names of objects. If None, use the words of the encoder: the 1,000 classes of
+            vocabulary: Candidate names of objects. If None, use the words of the encoder: the 1,000 classes of
                 imagenet, the names of colors, or the texts of your own features. With other encoders, objects are only
                 numbered.
-            meters_per_unit: as in `catalogue`.
+            meters_per_unit: As in `catalogue`.
         Raises:
-            ValueError: the encoder cannot encode a word, or as in `why` and `catalogue`.
-            FileNotFoundError: as in `why` and `catalogue`.
+            ValueError: The encoder cannot encode a word, or as in `why` and `catalogue`.
+            FileNotFoundError: As in `why` and `catalogue`.
 
         >>> from normlift_ns import open_run
         >>> inventory = open_run(config).inventory()
@@ -452,7 +452,7 @@ class LiftedRun:
         It is the inverse of the transform that the training applied to the cameras.
 
         Raises:
-            FileNotFoundError, ValueError: as in `catalogue`.
+            FileNotFoundError, ValueError: As in `catalogue`.
         """
         return similarity_to_capture(self.folder, self.scene.identity)
 
@@ -470,9 +470,9 @@ class LiftedRun:
         `run.export(path, ~floaters.mask)` writes the scene without them.
 
         Args:
-            limit: floater score above which a Gaussian is a likely floater.
+            limit: Floater score above which a Gaussian is a likely floater.
         Raises:
-            ValueError: the limit is not finite.
+            ValueError: The limit is not finite.
 
         >>> from normlift_ns import open_run
         >>> floaters = open_run(config).floaters()
@@ -504,9 +504,9 @@ class LiftedRun:
         """Return the camera of a training image.
 
         Args:
-            view: index or name of the image. The folder and the suffix may be omitted.
+            view: Index or name of the image. The folder and the suffix may be omitted.
         Raises:
-            ValueError: several images have this name, or no image has it. The error for no image is also a KeyError and
+            ValueError: Several images have this name, or no image has it. The error for no image is also a KeyError and
                 an IndexError.
         """
         cameras, names = self.scene.train.cameras, self.scene.train.names
@@ -534,8 +534,8 @@ class LiftedRun:
         With an answer, selected Gaussians are colored by relevancy and the others are gray.
 
         Args:
-            view: training image as in `camera`, or any camera.
-            found: answer, or its finding for one prompt. If None, render the colors of the scene.
+            view: Training image as in `camera`, or any camera.
+            found: Answer, or its finding for one prompt. If None, render the colors of the scene.
         """
         camera = view if isinstance(view, Camera) else self.camera(view)
         settings = RasterSettings.recorded(self.field.manifest)
@@ -554,7 +554,7 @@ class LiftedRun:
         """Return `render` as a PIL image, with methods such as `save` and `show`.
 
         Args:
-            view, found: as in `render`.
+            view, found: As in `render`.
 
         >>> from normlift_ns import open_run
         >>> open_run(config).image("0001").size
@@ -588,12 +588,12 @@ def open_run(
 
     Args:
         load_config: config.yml of the run, or its folder.
-        data: current path of the dataset, if it was moved.
-        device: device of the text encoder (auto, cpu or cuda).
+        data: Current path of the dataset, if it was moved.
+        device: Device of the text encoder (auto, cpu or cuda).
         text_embeddings: NPZ file with a vector for each prompt, which replaces the text encoder of the lift.
-        prompt_template: template for prompts, such as "a photo of {}". If None, use the template of the lift.
+        prompt_template: Template for prompts, such as "a photo of {}". If None, use the template of the lift.
     Raises:
-        FileNotFoundError, ValueError: as in `open_scene`; also if the run has no semantics, or the semantics belong to
+        FileNotFoundError, ValueError: As in `open_scene`; also if the run has no semantics, or the semantics belong to
             other Gaussians.
 
     >>> run = open_run(config)

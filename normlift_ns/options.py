@@ -291,7 +291,7 @@ def check_prompt_list(name: str, texts: Sequence[str]) -> None:
 
     Args:
         name: Name of the option, for messages.
-        texts: The prompts.
+        texts: List of prompts.
     Raises:
         InputError: The prompts are not a list, or a prompt is empty, repeated, too long or has an invalid character.
     """
@@ -381,7 +381,7 @@ def check_path(name: str, value: object) -> Path:
 
     Args:
         name: Name of the option, for messages.
-        value: The string or path.
+        value: String or path to check.
     Raises:
         InputError: The value has the wrong type, or contains NUL or a character that the file system cannot encode.
         PathError: A name is too long, the path leads through a file, or its links form a loop.

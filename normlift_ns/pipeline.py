@@ -84,14 +84,14 @@ def lift_scene(
     """Lift 2D features onto the Gaussians of a trained scene.
 
     Args:
-        cache: folder for 2D features and evidence. It is created if missing, and may be deleted at any time.
-        device: device for rasterizing, lifting and voting.
-        encoder: options that queries need to encode prompts in the same way. The manifest stores them.
-        export: folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
-        report: progress callback, see `ProgressCallback`.
+        cache: Folder for 2D features and evidence. It is created if missing, and may be deleted at any time.
+        device: Device for rasterizing, lifting and voting.
+        encoder: Options that queries need to encode prompts in the same way. The manifest stores them.
+        export: Folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
+        report: Progress callback, see `ProgressCallback`.
     Raises:
-        ValueError, FileNotFoundError: an image, a label map or an option is not valid, or no pixel is labeled.
-        MemoryError: the lift does not fit into GPU memory.
+        ValueError, FileNotFoundError: An image, a label map or an option is not valid, or no pixel is labeled.
+        MemoryError: The lift does not fit into GPU memory.
     """
     collection = plan_collection(scene, source, options, cache, device=device, export=export)
     kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
@@ -109,10 +109,10 @@ def lift_collection(
     """Run the steps of a planned lift.
 
     Args:
-        kernels: result of `start_kernel_warm_up`.
-        device, encoder, report: as in `lift_scene`.
+        kernels: Result of `start_kernel_warm_up`.
+        device, encoder, report: As in `lift_scene`.
     Raises:
-        ValueError, FileNotFoundError, MemoryError: as in `lift_scene`.
+        ValueError, FileNotFoundError, MemoryError: As in `lift_scene`.
     """
     stages, facts = StageTimer(report), {}
     options, means, source = collection.options, collection.gaussians.means, collection.source
@@ -166,7 +166,7 @@ def plan_collection(
     """Choose the views and the rasterizer of a lift. If the lift is impossible, raise before any image is read.
 
     Args:
-        scene, source, options, cache, device, export: as in `lift_scene`.
+        scene, source, options, cache, device, export: As in `lift_scene`.
     """
     gaussians, names = scene.gaussians.to(device), scene.train.names
     options = replace(options, vote=clamp_k(options.vote, len(gaussians))) if options.refine else options
@@ -186,7 +186,7 @@ def resolve_gsplat_version(scene: Scene, options: LiftOptions) -> str:
     """Return the gsplat version whose rasterization rules a lift follows.
 
     Raises:
-        ValueError: the options select the rules of the installed gsplat, but it is not installed.
+        ValueError: The options select the rules of the installed gsplat, but it is not installed.
     """
     return resolve_gsplat_rules(options.gsplat_version, scene.identity.get("gsplat_rules"))
 
@@ -206,7 +206,7 @@ def min_agreement(options: LiftOptions, features: Mapping[str, Any] = MappingPro
     Masks of objects agree by more than chance even if they are damaged. Cells of a partition may agree only by chance.
 
     Args:
-        features: identity of the source of 2D features, as in the manifest.
+        features: Identity of the source of 2D features, as in the manifest.
     """
     if options.consensus_min_agreement is not None:
         return options.consensus_min_agreement
@@ -232,7 +232,7 @@ def recognition_facts(
     """Return the manifest entry for the recognition of regions in left-out views.
 
     Args:
-        sample: evidence and sampling probabilities of the Gaussians from `sample_gaussians` (default: sample them).
+        sample: Evidence and sampling probabilities of the Gaussians from `sample_gaussians` (default: sample them).
     """
     if sample is None:
         rows, size = views.evidence.rows, views.evidence.num_regions
@@ -251,7 +251,7 @@ def lift_features(
     The reliability R is always that of the features before the consensus.
 
     Args:
-        table: features of the regions, after the consensus if it is enabled.
+        table: Features of the regions, after the consensus if it is enabled.
     """
     kwargs = {"beta": options.reliability_beta, "unlabeled": options.unlabeled}
     lifted = lift(views.evidence, table, **kwargs)
@@ -267,8 +267,8 @@ def with_stored_reliability(lifted: Lifted, means: Float[Tensor, "n 3"], collect
     """Replace the paper's R with the kind of R that the options select.
 
     Args:
-        lifted: lift with the paper's R of the features before the consensus.
-        means: centers of the Gaussians.
+        lifted: Lift with the paper's R of the features before the consensus.
+        means: Centers of the Gaussians.
     """
     kind, beta, scalars = collection.options.reliability, collection.options.reliability_beta, lifted.scalars
     if kind == "paper":
@@ -292,10 +292,10 @@ def check_directions(counts: Int64[Tensor, " 2"], total: int, source: FeatureSou
     """Raise if no Gaussian received a direction, and warn if few did.
 
     Args:
-        counts: counts from `count_directions`, of all Gaussians.
-        total: number of Gaussians.
+        counts: Counts from `count_directions`, of all Gaussians.
+        total: Number of Gaussians.
     Raises:
-        ValueError: no Gaussian has a direction.
+        ValueError: No Gaussian has a direction.
     """
     lifted, entries = counts.tolist()
     if lifted == 0 and entries == 0:
@@ -343,7 +343,7 @@ def with_gate(options: LiftOptions, cosines: Float64[Tensor, " q"] | None) -> tu
     """Resolve the gate of the vote, and return it for the manifest if it was measured.
 
     Args:
-        cosines: cosines of all processes from `shared_region_cosines`, or None for the gate of the options.
+        cosines: Cosines of all processes from `shared_region_cosines`, or None for the gate of the options.
     """
     gate = None if cosines is None else relative_gate(cosines)
     if cosines is None or gate is None:
@@ -366,7 +366,7 @@ def vote_directions(
     """Let neighboring Gaussians vote on their directions.
 
     Args:
-        level: level of every region, to measure the gate. If None, use the gate of the options.
+        level: Level of every region, to measure the gate. If None, use the gate of the options.
     Returns:
         The index of the Gaussian whose direction each Gaussian takes, the options with the resolved parameters of the
         vote, and the manifest entries (the gate and shares of Gaussians).
@@ -399,8 +399,8 @@ def count_changes(
     The direction changes if the cosine between old and new direction is below `CHANGED_COSINE`.
 
     Args:
-        source: row in the lift of the Gaussian that provides the direction, for each of the first m Gaussians.
-        gaussians: indices of the first m Gaussians among all n. A hash of the index decides whether a Gaussian is
+        source: Row in the lift of the Gaussian that provides the direction, for each of the first m Gaussians.
+        gaussians: Indices of the first m Gaussians among all n. A hash of the index decides whether a Gaussian is
             sampled.
     """
     row = (hash_to_unit(gaussians) < min(1.0, _COMPARED / max(1, n))).nonzero().squeeze(1)
@@ -433,7 +433,7 @@ def lift_statistics(
 
     Args:
         reliability: R of all Gaussians.
-        facts: statistics of the consensus and the vote.
+        facts: Statistics of the consensus and the vote.
     """
     positive = reliability[reliability > 0].double().sort().values
     n, count, shares = reliability.numel(), len(positive), (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -455,7 +455,7 @@ def lift_provenance(
     """Return the metadata of a lift for the manifest.
 
     Args:
-        options: options with the gate that the vote used.
+        options: Options with the gate that the vote used.
     """
     scene, config = collection.scene, collection.config
     return {
@@ -484,10 +484,10 @@ class KernelWarmUp:
     Errors in the threads are suppressed, because the lift itself raises them again.
 
     Args:
-        rendering: calls that compile the kernels of renders.
-        early: calls that compile the other kernels that do not depend on the features.
-        lift: calls that compile the remaining kernels, as a function of the dimension of the features.
-        load: function that each thread calls first.
+        rendering: Calls that compile the kernels of renders.
+        early: Calls that compile the other kernels that do not depend on the features.
+        lift: Calls that compile the remaining kernels, as a function of the dimension of the features.
+        load: Function that each thread calls first.
     """
 
     def __init__(
@@ -554,7 +554,8 @@ def lift_calls(
     """Return calls that run stages of a lift on some Gaussians and discard the results, to compile their kernels.
 
     Returns:
-        Calls for consensus and neighbors, and a function that returns those for lift and vote of a feature dimension.
+        Calls for the consensus and the neighbors, and a function that returns the calls for the lift and the vote,
+        given the dimension of the features.
     """
     means, regions = means[:_WARM_UP_GAUSSIANS], _WARM_UP_REGIONS
     n, device = len(means), means.device

@@ -172,7 +172,7 @@ def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
     The devices share the work on views and Gaussians, but not the preparation, the loading of networks and the writing.
 
     Args:
-        num_devices: number of processes that share the work, each with its own device; at least 1.
+        num_devices: Number of processes that share the work, each with its own device; at least 1.
     Raises:
         ValueError: `num_devices` is less than 1.
     """
@@ -259,9 +259,9 @@ def measure_core(
     then has as many entries as in the lift. `Rate` explains the parts of a cost.
 
     Args:
-        evidence: evidence of a few views.
-        features: features of the regions in these views.
-        views: number of views in the whole lift.
+        evidence: Evidence of a few views.
+        features: Features of the regions in these views.
+        views: Number of views in the whole lift.
     """
     repeated = min(views, _MAX_SAMPLE_VIEWS)
     times = max(1, round(repeated / evidence.num_views))
@@ -389,7 +389,7 @@ def diagnose_recognition(run_dirs: Iterable[Path]) -> list[Diagnostic]:
     """Report how well the first lifted run in the given folders recognizes left-out views, according to its manifest.
 
     Args:
-        run_dirs: folders that may contain a lifted run.
+        run_dirs: Folders that may contain a lifted run.
     """
     for run_dir in run_dirs:
         if (run_dir / FIELD_FOLDER / MANIFEST_FILE).is_file():
@@ -440,7 +440,7 @@ def _version(name: str) -> str | None:
 
 
 def missing_weights(options: SourceOptions, device: str) -> list[str]:
-    """Return a description of all network weights that the options need and that are not on this machine."""
+    """Return descriptions of the network weights that the options need and that are not on this machine."""
     if options.features != "none":
         return []
     options, missing = resolve_source(options, device), []
@@ -549,12 +549,12 @@ def measure_capture(
     """Process a few views of a scene as in a lift, and measure the cost.
 
     Args:
-        source: as in `lift_scene`.
-        cache: folder of 2D features and evidence. The function only reads it.
-        before: seconds of the steps before the views, by name (start, open, kernels, check).
-        clock: clock in seconds; `time.process_time` measures the time of all cores.
+        source: As in `lift_scene`.
+        cache: Folder of 2D features and evidence. The function only reads it.
+        before: Seconds of the steps before the views, by name (start, open, kernels, check).
+        clock: Clock in seconds; `time.process_time` measures the time of all cores.
     Raises:
-        ValueError, FileNotFoundError, MemoryError: as in `lift_scene`.
+        ValueError, FileNotFoundError, MemoryError: As in `lift_scene`.
     """
     collection = pipeline.plan_collection(scene, source, options, cache, device=device, export=None)
     gaussians, used, drawing = collection.gaussians, collection.views, collection.config
@@ -657,7 +657,7 @@ def _evidence_cached(
     """Return the share of views whose evidence is cached.
 
     Args:
-        groups: batches of sample views, each with the number of views that it represents.
+        groups: Batches of sample views, each with the number of views that it represents.
     """
     if not collection.options.reuse_evidence:
         return 0.0
@@ -693,7 +693,7 @@ def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
     """Open the capture of a request, and record the seconds of the stages `start` and `open`.
 
     Args:
-        start_time: value of `time.perf_counter` at the start of the command.
+        start_time: Value of `time.perf_counter` at the start of the command.
     """
     import_time = perf_counter()
     scene = request.open_scene()
@@ -723,10 +723,10 @@ def dry_run(request: LiftRequest, num_devices: int, start_time: float) -> Plan:
     """Estimate the time, memory and disk space of a lift without running it.
 
     Args:
-        num_devices: number of processes that share the work.
-        start_time: value of `time.perf_counter` at the start of the command.
+        num_devices: Number of processes that share the work.
+        start_time: Value of `time.perf_counter` at the start of the command.
     Raises:
-        ValueError, FileNotFoundError, MemoryError: as in the lift; also if weights are not on this machine.
+        ValueError, FileNotFoundError, MemoryError: As in the lift; also if weights are not on this machine.
     """
     device, lift = choose_device(request.device), request.lift or LiftOptions()
     init_cuda(device)

@@ -30,10 +30,10 @@ class StageTimer:
         """Time a stage, or a part of it; yield a function to call after every step.
 
         Args:
-            stage: name of the stage.
-            total: number of steps of the whole stage.
+            stage: Name of the stage.
+            total: Number of steps of the whole stage.
         Raises:
-            MemoryError: the GPU is out of memory. The message names the stage.
+            MemoryError: The GPU is out of memory. The message names the stage.
         """
 
         def step() -> None:

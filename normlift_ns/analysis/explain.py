@@ -53,9 +53,9 @@ class RegionVote:
     region: int
     """Index of the region within its image."""
     weight: float
-    """E_s, in pixels."""
+    """E_s, the weight of the selection in this region, in pixels."""
     share: float
-    """Fraction of the image's weight in this region, in 0..1."""
+    """Weight in this region as a fraction of the weight in the whole image, in 0..1."""
     agreement: float
     """Cosine of the region's feature to the direction of the selection."""
 
@@ -67,11 +67,11 @@ class ViewVote:
     view: int
     """Index of the image in the order of the lift."""
     weight: float
-    """W_v, in pixels."""
+    """W_v, the weight of the selection in this image, in pixels."""
     share: float
     """Weight of this image as a fraction of the weight of all images, in 0..1."""
     agreement: float
-    """a_v, in -1..1."""
+    """a_v, the cosine between the vote of this image and the sum of all votes."""
     disagreement: float
     """Fraction of the total disagreement that comes from this image, in 0..1; 0 if all images agree."""
     regions: tuple[RegionVote, ...]
@@ -151,7 +151,7 @@ _LEVELS = (
     (0.6, "agree partly"),
     (0.0, "contradict each other"),
 )
-"""Minimum C_inter of each description."""
+"""Pairs of a minimum C_inter and the words that describe this agreement of the images."""
 
 
 def explain_selection(
@@ -166,12 +166,12 @@ def explain_selection(
     """Explain a selection by the votes of the images.
 
     Args:
-        features: one unit row per column (region) of the evidence.
+        features: One unit row per column (region) of the evidence.
         selected: True for the selected Gaussians.
-        source: index of the Gaussian whose direction each Gaussian uses, from `refine`; None if each uses its own.
-        beta, unlabeled: as in `lift`.
+        source: Index of the Gaussian whose direction each Gaussian uses, from `refine`; None if each uses its own.
+        beta, unlabeled: As in `lift`.
     Raises:
-        ValueError: nothing is selected, or the numbers of Gaussians or regions differ.
+        ValueError: Nothing is selected, or the numbers of Gaussians or regions differ.
     """
     n = evidence.num_gaussians
     if selected.dtype != torch.bool or selected.shape != (n,):
@@ -191,7 +191,10 @@ def explain_selection(
 
 
 def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: Tensor) -> float:
-    """Return the share of pairs of a Gaussian in `rows` and the one in `origin` whose directions differ."""
+    """Compare each Gaussian in `rows` with the one at the same position in `origin`.
+
+    Return the share of the pairs whose directions differ.
+    """
     step = -(-len(rows) // _COMPARED)
     rows, origin = rows[::step], origin[::step]
     other, table = rows != origin, torch.nn.functional.normalize(features.to(rows.device).float(), dim=1)
@@ -308,7 +311,7 @@ class RecordedVotes:
         """Names of the images in the order of the lift.
 
         Raises:
-            ValueError: the run does not record the names or has evidence of a different number of images, or the
+            ValueError: The run does not record the names or has evidence of a different number of images, or the
                 dataset no longer has all images.
         """
         names = self.field.manifest.get("views_lifted")
@@ -335,9 +338,9 @@ class RecordedVotes:
         """Explain a selection by the votes of the images; see `explain_selection`.
 
         Args:
-            refined: for a Gaussian that took over the direction of a neighbor, use the evidence of that neighbor.
+            refined: For a Gaussian that took over the direction of a neighbor, use the evidence of that neighbor.
         Raises:
-            ValueError: nothing is selected, or the votes are no longer in the cache.
+            ValueError: Nothing is selected, or the votes are no longer in the cache.
         """
         evidence, features = self.table
         source = self.field.source if refined else None
@@ -348,8 +351,8 @@ class RecordedVotes:
         """Yield the images one after another, with outlines of the regions that voted.
 
         Raises:
-            FileNotFoundError: an image no longer exists.
-            ValueError: an image has changed, or its regions are no longer in the cache. The regions of features passed
+            FileNotFoundError: An image no longer exists.
+            ValueError: An image has changed, or its regions are no longer in the cache. The regions of features passed
                 from Python are never in the cache.
         """
         for vote in votes:
@@ -365,7 +368,7 @@ class RecordedVotes:
         """Evidence of all images, and the feature of every region.
 
         Raises:
-            ValueError: the votes are no longer in the cache.
+            ValueError: The votes are no longer in the cache.
         """
         store = self.field.store
         if isinstance(store, StoredEvidence):
@@ -383,8 +386,10 @@ class RecordedVotes:
 
     @property
     def disagreement(self) -> float:
-        """Usual disagreement of the views about a Gaussian: 1 - median ||f_j||, the mean of before and after the
-        consensus.
+        """Usual disagreement of the views about a Gaussian, 1 - median ||f_j||.
+
+        It is the mean of the values before and after the consensus, or the value after the consensus if the other one
+        is unknown.
         """
         scalars = self.field.scalars
         if not bool((scalars.norm > 0).any()):

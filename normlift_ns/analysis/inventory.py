@@ -1,9 +1,9 @@
 """Objects of a scene without prompts: parts whose Gaussians share regions in the images.
 
 Two neighboring Gaussians get a count from each image in which both have a region. The count is 1 if both have the same
-region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s = 1 - median ||f_j||
-measures how much the views usually disagree, the mean of before and after the consensus. The affinity of two parts is
-the mean of the counts over all images and all pairs of neighbors across their border::
+region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s measures how much
+the views usually disagree. It is the mean of 1 - median ||f_j|| before and after the consensus. The affinity of two
+parts is the mean of the counts over all images and all pairs of neighbors across their border::
 
     a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
 
@@ -76,7 +76,7 @@ class Inventory:
         """Return the mask of the Gaussians of an object.
 
         Raises:
-            ValueError: the inventory has no object with this number.
+            ValueError: The inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
             raise InputError(f"Object {number} is not in the inventory, which has objects 1 to {len(self)}.")
@@ -106,7 +106,7 @@ class Vocabulary:
         """Return a vocabulary without duplicates for the encoder with this name.
 
         Raises:
-            ValueError: a word is empty, or the encoder cannot encode it.
+            ValueError: A word is empty, or the encoder cannot encode it.
         """
         words, kind = tuple(dict.fromkeys(words)), find_encoder_kind(encoder)
         check_prompt_list("vocabulary", words)
@@ -155,11 +155,11 @@ def list_inventory(
     """Find the main objects of a scene, name them, and list them.
 
     Args:
-        votes: evidence of the lift, with its scene and its field.
-        vocabulary: candidate names. An object keeps its number as its name if none of them fits.
-        transform, meters_per_unit, device: as in `make_catalogue`.
+        votes: Evidence of the lift, with its scene and its field.
+        vocabulary: Candidate names. An object keeps its number as its name if none of them fits.
+        transform, meters_per_unit, device: As in `make_catalogue`.
     Raises:
-        ValueError, FileNotFoundError: as in `RecordedVotes.table` and `make_catalogue`.
+        ValueError, FileNotFoundError: As in `RecordedVotes.table` and `make_catalogue`.
     """
     scene, field = votes.scene, votes.field
     evidence, features = votes.table
@@ -182,9 +182,9 @@ def find_inventory(
     thousandth of the evidence of all images.
 
     Args:
-        features: one unit row per column (region) of the evidence.
-        means: centers of the Gaussians.
-        spread: usual disagreement of the views about a Gaussian, `RecordedVotes.disagreement`.
+        features: One unit row per column (region) of the evidence.
+        means: Centers of the Gaussians.
+        spread: Usual disagreement of the views about a Gaussian, `RecordedVotes.disagreement`.
     """
     evidence = evidence.to("cpu")
     part = _join(len(means), _neighbor_borders(view_regions(evidence), features.cpu(), means.cpu(), spread))
@@ -243,7 +243,7 @@ def _neighbor_borders(
 
 
 def _similarity(one: Tensor, other: Tensor, features: Tensor, spread: float) -> Float64[Tensor, " p"]:
-    """Return the count of each of P pairs of regions of one image; it is 1 if both are the same region."""
+    """Return the similarity of each of P pairs of regions in one image, in 0..1; 1 if both are the same region."""
     count = torch.ones(len(one), dtype=torch.float64)
     differs = (one != other).nonzero().squeeze(1)
     key, index = (one[differs] * len(features) + other[differs]).unique(return_inverse=True)
@@ -316,7 +316,7 @@ def name_objects(
     The word must be the best name, have the verdict "found", and select more than half of the object.
 
     Args:
-        directions: unit directions of the objects, from `mean_directions`.
+        directions: Unit directions of the objects, from `mean_directions`.
     """
     names = [f"object {number}" for number in range(1, len(directions) + 1)]
     if len(vocabulary.words) == 0 or len(names) == 0:
@@ -360,11 +360,11 @@ def best_words(
     are names, the scores are standardized over all words, and the best name must also have the best score.
 
     Args:
-        directions: unit directions of the objects, from `mean_directions`.
-        scene: directions of a sample of the Gaussians of the scene.
-        vectors: one unit row per word, names first.
-        by_chance: expected number of pairs that exceed the limit by chance; inf accepts every best name.
-        count: number of words that are names.
+        directions: Unit directions of the objects, from `mean_directions`.
+        scene: Directions of a sample of the Gaussians of the scene.
+        vectors: One unit row per word, names first.
+        by_chance: Expected number of pairs that exceed the limit by chance; inf accepts every best name.
+        count: Number of words that are names.
     """
     cosine = directions @ vectors.to(directions).T
     best = cosine[:, :count].argmax(dim=1)

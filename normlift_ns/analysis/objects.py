@@ -62,7 +62,7 @@ class OrientedBox:
         return self.center + (signs * self.size) @ self.axes
 
     def transformed(self, by: SimilarityTransform) -> OrientedBox:
-        """Return the transformed box."""
+        """Return the box after a similarity transform."""
         center = torch.from_numpy(by.transform_points(self.center.numpy()[None])[0])
         return OrientedBox(center, by.scale * self.size, self.axes @ torch.from_numpy(by.rotation).T)
 
@@ -121,7 +121,7 @@ class SceneObject:
     """Summary of one object, in scene units. Means are weighted by W_j, the weight of Gaussian j over all views."""
 
     size: int
-    """Number of Gaussians."""
+    """Number of Gaussians of the object."""
     centroid: list[float]
     box: dict[str, list[float]]
     """Lowest corner "min" and highest corner "max" of the axis-aligned bounding box of the centers, as lists.
@@ -159,8 +159,8 @@ def find_objects(
     """Divide a selection into objects, which are its connected components.
 
     Args:
-        max_gap: as in `connected_components`.
-        min_gaussians: minimum number of Gaussians in an object, >= 1; smaller components are not listed.
+        max_gap: As in `connected_components`.
+        min_gaussians: Minimum number of Gaussians in an object, >= 1; smaller components are not listed.
     Raises:
         ValueError: `min_gaussians` is less than 1, or `max_gap` is not positive and finite.
     """
@@ -211,7 +211,7 @@ def connected_components(
     different position. Components of equal size are ordered by their first Gaussian.
 
     Args:
-        max_gap: maximum distance in units of the median spacing, > 0.
+        max_gap: Maximum distance in units of the median spacing, > 0.
     Raises:
         ValueError: `max_gap` is not positive and finite.
     """
@@ -251,8 +251,8 @@ class Instances:
     selection, so further prompts do not change existing numbers.
     """
     classes: tuple[int, ...]
-    """Class of each object, starting with object 1. An object has no Gaussians if all of them belong to other
-    prompts."""
+    """Class of each object, starting with object 1. An object has no Gaussians if all Gaussians of its
+    component belong to other prompts."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the prompt of each class, and the class, prompt and size of each object, as plain Python types.
@@ -271,7 +271,7 @@ class Instances:
 
 
 def best_prompt(relevancy: Float[Tensor, "n q"], selected: Bool[Tensor, "n q"]) -> Int32[Tensor, " n"]:
-    """Return the index of the prompt with the largest relevancy among those that select the Gaussian; -1 if none does.
+    """Return, for every Gaussian, the index of the most relevant prompt among those that select it; -1 if none does.
 
     Ties go to the first prompt.
 
@@ -298,10 +298,10 @@ def find_instances(
     prompt that contains it.
 
     Args:
-        texts: prompts.
-        max_gap, min_gaussians: as in `find_objects`.
+        texts: Prompts.
+        max_gap, min_gaussians: As in `find_objects`.
     Raises:
-        ValueError: as in `find_objects`.
+        ValueError: As in `find_objects`.
 
     >>> means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [9, 0, 0], [5, 0, 0]])
     >>> relevancy = torch.tensor([[0.9, 0.8], [0.7, 0.1], [0.6, 0.9], [0.1, 0.2]])
@@ -392,8 +392,8 @@ class CatalogueObject:
     views: int
     """Number of training images that show the object."""
     best_views: tuple[str, ...]
-    """Names of up to three images. Images of the whole object come first; among these, and among the others, larger
-    objects come first."""
+    """Names of up to three images. Images of the whole object come first. Within each group, images that show it larger
+    come first."""
     capture: Placement
     """Position and size in the coordinates of the capture."""
     scene: Placement
@@ -431,9 +431,9 @@ def similarity_to_capture(run_dir: Path, identity: Mapping[str, Any]) -> Similar
     """Return the transform from the coordinates of the Gaussians of a lifted run to those of the capture.
 
     Args:
-        run_dir, identity: as in `capture_transforms`.
+        run_dir, identity: As in `capture_transforms`.
     Raises:
-        ValueError, FileNotFoundError: as in `capture_transforms`.
+        ValueError, FileNotFoundError: As in `capture_transforms`.
     """
     worlds = capture_transforms(run_dir, identity)
     inverses = (SimilarityTransform.inverse_of(world.transform, world.scale) for world in reversed(worlds))
@@ -452,10 +452,10 @@ def make_catalogue(
     """Make a catalog of objects.
 
     Args:
-        instances: objects to list.
-        capture: transform from the coordinates of the scene to those of the capture.
-        meters_per_unit: length of a capture unit in meters, > 0; None if unknown.
-        device: device for the renders that rank images.
+        instances: Objects to list.
+        capture: Transform from the coordinates of the scene to those of the capture.
+        meters_per_unit: Length of a capture unit in meters, > 0; None if unknown.
+        device: Device for the renders that rank images.
     """
     unit = 1.0 if meters_per_unit is None else meters_per_unit
     to_capture = SimilarityTransform(capture.rotation, unit * capture.scale, unit * capture.shift)
@@ -544,11 +544,11 @@ def write_catalogue(
     objects_scene.ply (boxes in the coordinates of the Gaussians). docs/objects.md explains them.
 
     Args:
-        question: query that found the objects, as JSON types; it is written to objects.json.
-        overwrite: replace existing files.
+        question: Query that found the objects, as JSON types; it is written to objects.json.
+        overwrite: Replace existing files.
     Raises:
-        FileExistsError: a file exists, and `overwrite` is False.
-        OSError: a file cannot be written.
+        FileExistsError: A file exists, and `overwrite` is False.
+        OSError: A file cannot be written.
     """
     files = tuple(folder / name for name in CATALOG_FILES)
     document = {**catalog.to_json(), **(question or {})}
@@ -680,10 +680,10 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
     """Score the Gaussians of a scene, with a higher score for more likely floaters.
 
     Args:
-        scalars: scalars of the Gaussians from a lift of the scene.
-        limit: score above which a Gaussian is a likely floater.
+        scalars: Scalars of the Gaussians from a lift of the scene.
+        limit: Score above which a Gaussian is a likely floater.
     Raises:
-        ValueError: the scalars have a different number of Gaussians, or the limit is not finite.
+        ValueError: The scalars have a different number of Gaussians, or the limit is not finite.
     """
     limit = check_number("floater_threshold", limit)
     if len(scalars.norm) != len(scene):

@@ -134,7 +134,7 @@ def _capture_key(command: NormLift) -> str:
 
 
 def _splat_options_of_0_2(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options of splats with the values that version 0.2 wrote into keys, so that batches of 0.2 stay valid."""
+    """Convert options of a splat to their form in capture keys of version 0.2, so that its batches stay valid."""
     new = {name: value for name, value in values.items() if name == "primitive" and value is not None}
     if values["world_transform"] is None:
         new["search"] = False
@@ -144,7 +144,10 @@ def _splat_options_of_0_2(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _lift_options_of_0_2(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options of lifts with the values that version 0.2 wrote into keys; new options only if they are set."""
+    """Convert options of a lift to their form in capture keys of version 0.2.
+
+    The result includes options that version 0.2 does not have only if they are set.
+    """
     old = {name: value for name, value in values.items() if name not in ("reliability", "recognition")}
     if old["consensus_least"] is None:
         old["consensus_least"] = 0.4
@@ -227,7 +230,8 @@ def make_shard(word: str, environment: Mapping[str, str]) -> Shard:
     In a Slurm array whose tasks have several ranks (RANK, WORLD_SIZE), each rank of each task has its own part.
 
     Args:
-        word: auto for the part that the environment defines, none for the whole list, or i/n for the i-th of n parts.
+        word: Value of --shard: auto for the part that the environment defines, none for the whole list, or i/n for the
+            i-th of n parts.
         environment: Environment variables.
     Raises:
         InputError: The word is invalid, variables contradict each other, or a Slurm array has gaps.

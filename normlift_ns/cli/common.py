@@ -302,7 +302,10 @@ _process_starts: list[float] = []
 
 
 def command_start() -> float:
-    """Return the start of the process of this command as a value of `time.perf_counter`, or else the current value."""
+    """Return the time at which the process of this command started, as a value of `time.perf_counter`.
+
+    Return the current time if the command is called as a function.
+    """
     return _process_starts[-1] if len(_process_starts) > 0 else time.perf_counter()
 
 
@@ -433,7 +436,10 @@ def info_progress(text: str) -> None:
 
 
 def info_opening(*paths: Path) -> None:
-    """Print the paths of files to open on standard error, which programs do not parse, unless --quiet is set."""
+    """Print which files the command opens, unless --quiet is set.
+
+    The message goes to standard error, which programs do not parse.
+    """
     if not output_settings[-1].quiet:
         print_error("Opening " + ", ".join(map(str, paths)))
 

@@ -44,7 +44,7 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
     """Join the other processes of the lift. Only the first process prints.
 
     Args:
-        device: cpu, cuda or auto.
+        device: Device to lift on: cpu, cuda or auto.
     Yields:
         The communicator, or None if there is only one process.
     """
@@ -389,7 +389,7 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
     """Describe the effect of the consensus on one level of regions.
 
     Args:
-        agreement: B of the level, in 0..1.
+        agreement: Agreement B of the regions of the level across views, in 0..1.
         least: Value of --consensus-min-agreement.
         kind: Kind of regions, such as sam or superpixel.
 

@@ -183,7 +183,7 @@ def check_splat_paths(ply: Path | None, gsplat: Path | None, splat: SplatOptions
 
 
 def refuse_unused(options: Any, names: Iterable[str], needed: str) -> None:
-    """Raise InputError if one of these options, which have no effect without `needed`, differs from its default."""
+    """Raise InputError if an option in `names`, which has no effect without `needed`, differs from its default."""
     for name in names:
         if getattr(options, name) != getattr(type(options), name):
             raise InputError(f"{option_name(name)} has no effect without {needed}; add that, or leave this option out")

@@ -133,7 +133,7 @@ class NormLiftQuery(CheckedOptions):
     """Device for the text encoder and the renders: auto, cpu or cuda."""
 
     def main(self) -> list[dict[str, Any]]:
-        """Run the query, write files, print the table and return its rows."""
+        """Run the query, write files, print the table and return its rows; none with --stdin or --interactive."""
         self._check()
         common.info_opening(self.load_config)
         if self.render_dir is not None:  # torch loads while the run answers without it

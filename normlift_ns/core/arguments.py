@@ -84,8 +84,8 @@ def check_rows(name: str, rows: Any, size: int, low: int = 0) -> None:
     """Raise InputError unless all row indices are in low..size - 1.
 
     Args:
-        size: number of rows.
-        low: smallest valid index, -1 if -1 marks a missing row.
+        size: Number of rows.
+        low: Smallest valid index, -1 if -1 marks a missing row.
     """
     first, last = map(int, rows.aminmax()) if rows.numel() > 0 else (low, low)
     if first < low or max(last, 0) >= max(size, 1):

@@ -9,7 +9,7 @@ import numba
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return `numba.njit` with a cache on disk, if a cache folder is writable."""
+    """Return a decorator like `numba.njit`, with a cache on disk if a cache folder is writable."""
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:

@@ -103,13 +103,13 @@ def consensus(
     """Compute F', the features of all regions after the consensus, with the formulas at the top of this module.
 
     Args:
-        features: unit rows or 0, one per column of the evidence.
-        level: level of every region (default: the same for all). Regions of different levels are not compared.
+        features: Unit rows or 0, one per column of the evidence.
+        level: Level of every region (default: the same for all). Regions of different levels are not compared.
         power: q, the exponent of c_ts, >= 0.
-        sample: smallest number of Gaussians to sample in a region, >= 1. Smaller regions use all their Gaussians.
-        least: largest B that regions reach by chance, in 0..1. Up to this B, regions keep their features.
+        sample: Smallest number of Gaussians to sample in a region, >= 1. Smaller regions use all their Gaussians.
+        least: Largest B that regions reach by chance, in 0..1. Up to this B, regions keep their features.
     Raises:
-        ValueError: if `features` or `level` has the wrong length, a feature is neither a unit vector nor 0, or another
+        ValueError: If `features` or `level` has the wrong length, a feature is neither a unit vector nor 0, or another
             argument is out of range.
 
     >>> import torch
@@ -159,9 +159,9 @@ def sampled_consensus(
     """Compute the consensus from the evidence of sampled Gaussians.
 
     Args:
-        sampled: evidence of the Gaussians from `sample_gaussians`.
-        probability: sampling probability of each row.
-        features, level, power, least: as in `consensus`.
+        sampled: Evidence of the Gaussians from `sample_gaussians`.
+        probability: Sampling probability of each row.
+        features, level, power, least: As in `consensus`.
     """
     rows, size, device = sampled.rows, sampled.num_regions, sampled.rows.weight.device
     level = torch.zeros(size, dtype=torch.int64) if level is None else level
@@ -181,8 +181,8 @@ def with_original_reliability(scalars: Scalars, original: Scalars) -> Scalars:
     """Return the scalars of the lift of F' with the R of the lift of F, or R = 0 if F' gives no direction.
 
     Args:
-        scalars: scalars of the lift of F'.
-        original: scalars of the lift of F.
+        scalars: Scalars of the lift of F'.
+        original: Scalars of the lift of F.
     """
     return replace(scalars, reliability=torch.where(scalars.norm > 0, original.reliability, 0.0))
 
@@ -190,7 +190,8 @@ def with_original_reliability(scalars: Scalars, original: Scalars) -> Scalars:
 def apply_consensus(
     features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0, least: float = CHANCE_AGREEMENT
 ) -> Float[Tensor, "s d"]:
-    """Return F' of the regions of one level. Regions without overlaps keep their rows of F."""
+    """Return F', the features after the consensus, for the regions of one level. Regions without overlaps keep their
+    rows of F."""
     strength = min(1.0, max(0.0, (overlaps.agreement - least) / AGREEMENT_RAMP))
     if strength == 0 or overlaps.iou.weight.numel() == 0:
         return features
@@ -212,7 +213,7 @@ def sample_gaussians(
     number is below its share. Sums over the sample are unbiased if every term is divided by its sampling probability.
 
     Args:
-        portion: part of the Gaussians that `rows` covers (default: all). Counts include all processes.
+        portion: Part of the Gaussians that `rows` covers (default: all). Counts include all processes.
     Returns:
         Indices of the sampled rows, and the sampling probability of each.
     """
@@ -239,7 +240,7 @@ def total_view_weights(evidence: Evidence, levels: int = 1) -> SparseRows:
     """Return W_jv, the weight of every Gaussian in every view, [M, views]. Pixels without a region count too.
 
     Args:
-        levels: number of levels. Weights are divided by it, because the evidence counts every pixel once per level.
+        levels: Number of levels. Weights are divided by it, because the evidence counts every pixel once per level.
     """
     total = SparseRows.add(evidence.view_weights(), evidence.unlabeled)
     return replace(total, weight=total.weight / levels)
@@ -251,12 +252,12 @@ def region_overlaps(
     probability: Float64[Tensor, " m"] | None = None,
     total: SparseRows | None = None,
 ) -> Overlaps:
-    """Compute J of all regions of one level from the evidence of some Gaussians.
+    """Compute the overlaps of all regions of one level from the evidence of some Gaussians.
 
     Args:
         rows: E, [M, S].
-        region_view: view of every column, non-decreasing.
-        probability: sampling probability of every row (default: 1, if the rows are not a sample).
+        region_view: Index of the view of every column, in non-decreasing order.
+        probability: Sampling probability of every row (default: 1, if the rows are not a sample).
         total: W_jv, [M, views], including pixels without a region (default: all pixels have a region).
     """
     size, view = len(region_view), region_view.long()

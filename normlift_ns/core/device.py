@@ -61,13 +61,13 @@ def retry_in_halves(run: Callable[[Items], Result], items: Items, advice: str) -
     """Run a function on all items. If the GPU runs out of memory, split the items into halves recursively.
 
     Args:
-        run: function that returns the result for some of the items.
-        items: sequence, or tensor that is split along its first dimension.
-        advice: suggestion for the user in the message of the MemoryError.
+        run: Function that returns the result for some of the items.
+        items: Sequence, or tensor that is split along its first dimension.
+        advice: Suggestion for the user in the message of the MemoryError.
     Returns:
         The results of all parts, in order.
     Raises:
-        MemoryError: if a single item does not fit into GPU memory.
+        MemoryError: If a single item does not fit into GPU memory.
     """
     try:
         return [run(items)]
@@ -97,7 +97,7 @@ _triton_lock = Lock()
 
 
 def load_triton() -> None:
-    """Load what all kernels of Triton need, once in this process: a hash of Triton's files and its driver.
+    """Load the hash of Triton's files and the driver, which all kernels of Triton need, once in this process.
 
     Without the lock, every thread that compiles a kernel would compute the hash and compile the driver. Errors are
     ignored here. They occur again in the first kernel.
@@ -112,7 +112,7 @@ def choose_device(device: str) -> str:
     """Return the device to use. "auto" selects cuda if available, else cpu.
 
     Raises:
-        ValueError: if the device is unknown or this machine does not have it.
+        ValueError: If the device is unknown or this machine does not have it.
     """
     device = check_device(device)
     if device.startswith("cuda"):
@@ -178,7 +178,7 @@ class AdaptiveBatches:
         """Yield the results of the function on consecutive batches of items.
 
         Raises:
-            MemoryError: if a single item does not fit into GPU memory.
+            MemoryError: If a single item does not fit into GPU memory.
         """
         start = 0
         while start < len(items):
@@ -200,7 +200,7 @@ class AdaptiveBatches:
         The next part is requested when a batch has room for more items. Rows are yielded as soon as they are computed.
 
         Raises:
-            MemoryError: if a single item does not fit into GPU memory.
+            MemoryError: If a single item does not fit into GPU memory.
         """
         counts, queue, rows = deque[int](), list[Item](), deque[Tensor]()
         for part in parts:

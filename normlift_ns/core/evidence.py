@@ -67,7 +67,7 @@ class Evidence(TensorRecord):
     rows: SparseRows
     """E, [N, S]. Every entry E_js is the sum of A_ij ** weight_power, > 0."""
     region_view: Int32[Tensor, " s"]
-    """View of every column, non-decreasing."""
+    """Index of the view of every column, in non-decreasing order."""
     unlabeled: SparseRows
     """Weight of Gaussian j in the unlabeled pixels of view v, [N, views]."""
     num_views: int
@@ -102,7 +102,7 @@ class Evidence(TensorRecord):
 
     @property
     def num_gaussians(self) -> int:
-        """N, including Gaussians without evidence."""
+        """N, the number of Gaussians, including those without evidence."""
         return len(self.rows)
 
     @property
@@ -123,7 +123,7 @@ class Evidence(TensorRecord):
         """Build evidence from the entries of all views, in the given order.
 
         Raises:
-            ValueError: if `num_gaussians` is not in 0..2**31 - 1, or entries are not sorted, have invalid indices, or
+            ValueError: If `num_gaussians` is not in 0..2**31 - 1, or entries are not sorted, have invalid indices, or
                 have negative or non-finite weights.
         """
         if not 0 <= num_gaussians < 2**31:
@@ -167,7 +167,7 @@ class Evidence(TensorRecord):
         `features[evidence.columns_of(v)]` is the feature table of `evidence.select_views(v)`.
 
         Raises:
-            ValueError: if a view does not exist or occurs twice.
+            ValueError: If a view does not exist or occurs twice.
         """
         chosen = views.tolist() if isinstance(views, Tensor) else list(views)
         if len(set(chosen)) != len(chosen) or any(not 0 <= v < self.num_views for v in chosen):
@@ -181,7 +181,7 @@ class Evidence(TensorRecord):
         """Return the evidence of some views, renumbered in the given order.
 
         Raises:
-            ValueError: if a view does not exist or occurs twice.
+            ValueError: If a view does not exist or occurs twice.
         """
         columns = self.columns_of(views)
         chosen = torch.as_tensor(views, dtype=torch.int64, device=columns.device)
@@ -197,7 +197,7 @@ class Evidence(TensorRecord):
         """Return the evidence of some Gaussians, in the given order.
 
         Raises:
-            ValueError: if a Gaussian does not exist.
+            ValueError: If a Gaussian does not exist.
         """
         check_rows("gaussians", gaussians, self.num_gaussians)
         rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
@@ -216,10 +216,10 @@ class Evidence(TensorRecord):
         on the scale of W.
 
         Args:
-            columns: new column of every old column, or -1 for none, with one row per level.
-            region_view: view of every new column, non-decreasing.
+            columns: New column of every old column, or -1 for none, with one row per level.
+            region_view: Index of the view of every new column, in non-decreasing order.
         Raises:
-            ValueError: if a new column does not exist, or belongs to a different view than its old columns.
+            ValueError: If a new column does not exist, or belongs to a different view than its old columns.
         """
         if columns.shape[1] != self.num_regions or not bool(((columns >= -1) & (columns < len(region_view))).all()):
             raise InputError(
@@ -254,7 +254,7 @@ class Evidence(TensorRecord):
         The feature tables must be concatenated in the same order.
 
         Raises:
-            ValueError: if no part is given, or if the parts differ in the weight power or in the number of Gaussians or
+            ValueError: If no part is given, or if the parts differ in the weight power or in the number of Gaussians or
                 excluded Gaussians.
         """
         if not parts:
@@ -277,12 +277,12 @@ class Evidence(TensorRecord):
         """Write a safetensors file atomically, replacing an earlier one, and return its digest.
 
         Args:
-            key: cache key, which is part of the digest.
-            remarks: additional metadata for the file header, by name.
-            own: skip the checks of `io.guard`, for files in a run or cache of this package.
+            key: Cache key, which is part of the digest.
+            remarks: Additional metadata for the file header, by name.
+            own: Skip the checks of `io.guard`, for files in a run or cache of this package.
         Raises:
-            ValueError: if this would replace an input, a file of a run or data set, or a file of a different type.
-            OSError: if the file cannot be written, for instance because the disk is full.
+            ValueError: If this would replace an input, a file of a run or data set, or a file of a different type.
+            OSError: If the file cannot be written, for instance because the disk is full.
         """
         rows, blank = self.rows, self.unlabeled
         tensors = {"offsets": rows.offsets, "region": rows.column, "weight": rows.weight}
@@ -301,10 +301,10 @@ class Evidence(TensorRecord):
         """Read a file that `save` wrote.
 
         Args:
-            key: the key passed to `save`. With a key, files of version 0.1 are rejected, because they have no digest.
+            key: The key passed to `save`. With a key, files of version 0.1 are rejected, because they have no digest.
         Raises:
-            FileNotFoundError: if the file does not exist.
-            ValueError: if the file is damaged or is not an evidence file.
+            FileNotFoundError: If the file does not exist.
+            ValueError: If the file is damaged or is not an evidence file.
         """
         remedy = "rasterize again"
         arrays = read_evidence(Path(path), key=key, remedy=remedy)

@@ -39,7 +39,10 @@ from normlift_ns.io.run_dir import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, wr
 from normlift_ns.options import RelevancyRule, Storage
 
 CHANGED_COSINE = 0.98
-"""Cosine of the directions before and after the vote below which a Gaussian counts as changed, about 11 degrees."""
+"""Limit on the cosine between the directions of a Gaussian before and after the vote, about 11 degrees.
+
+Below the limit, the Gaussian counts as changed.
+"""
 
 
 @check_arguments
@@ -94,12 +97,12 @@ class SemanticField(TensorRecord):
         """Build a field, and record the size and error bound of all three storage forms in its manifest.
 
         Args:
-            source: result of `refine` (default: no refinement).
-            tolerance: largest error of the cosine between any Gaussian and any unit vector, > 0.
+            source: Result of `refine` (default: no refinement).
+            tolerance: Largest error of the cosine between any Gaussian and any unit vector, > 0.
             storage: "auto" chooses the smallest storage whose bound is within the tolerance.
             provenance: JSON-ready metadata for the manifest, such as source config, step, encoder and hyperparameters.
         Raises:
-            ValueError: if `means` or `source` has the wrong length, an option is invalid, or no rank meets the
+            ValueError: If `means` or `source` has the wrong length, an option is invalid, or no rank meets the
                 tolerance for storage "low_rank".
         """
         n = len(lifted.scalars.norm)
@@ -130,8 +133,8 @@ class SemanticField(TensorRecord):
         """Return a field with float32 scalars and a manifest that identifies the Gaussians.
 
         Args:
-            provenance: as in `build`.
-            facts: metadata of the storage form for the manifest, from `choose_form`.
+            provenance: As in `build`.
+            facts: Metadata of the storage form for the manifest, from `choose_form`.
         """
         dimension = store.features.shape[1] if isinstance(store, StoredEvidence) else store.dimension
         manifest = {
@@ -160,7 +163,7 @@ class SemanticField(TensorRecord):
         The cosine is 0 for Gaussians without a direction.
 
         Raises:
-            ValueError: if a vector has the wrong dimension, is zero or is not finite.
+            ValueError: If a vector has the wrong dimension, is zero or is not finite.
         """
         if text_vectors.shape[1] != self.dimension:
             raise InputError(
@@ -198,7 +201,7 @@ class SemanticField(TensorRecord):
         A Gaussian without a direction gets a relevancy of 0, or -2 for the rule "margin", and is never selected.
 
         Args:
-            negatives: vectors of the negative prompts, for rules that need them.
+            negatives: Vectors of the negative prompts, for rules that need them.
         """
         count = len(text_vectors)
         cosine = self.query(
@@ -229,12 +232,12 @@ class SemanticField(TensorRecord):
         A folder with a manifest is complete. The manifest contains the digests of the files.
 
         Args:
-            beside: digests of other files that belong to the field, by their paths relative to the folder.
-            own: skip the checks of `io.guard`, for folders in a run of this package.
+            beside: Digests of other files that belong to the field, by their paths relative to the folder.
+            own: Skip the checks of `io.guard`, for folders in a run of this package.
         Raises:
-            ValueError: if this would replace an input, a file of a run or data set, or a file of a different type.
-            FileExistsError: if the folder contains a field and `overwrite` is False.
-            OSError: if a file cannot be written, for instance because the disk is full.
+            ValueError: If this would replace an input, a file of a run or data set, or a file of a different type.
+            FileExistsError: If the folder contains a field and `overwrite` is False.
+            OSError: If a file cannot be written, for instance because the disk is full.
         """
         folder = Path(folder)
         _check_target(folder, {**self.manifest, "digests": dict(beside)})
@@ -272,11 +275,11 @@ class SemanticField(TensorRecord):
         """Read a field that `save` wrote.
 
         Args:
-            means: centers of the Gaussians that the field must belong to (default: no check).
-            checkpoint: source of the means, for error messages.
+            means: Centers of the Gaussians that the field must belong to (default: no check).
+            checkpoint: Source of the means, for error messages.
         Raises:
-            FileNotFoundError: if the folder does not contain a complete field.
-            ValueError: if the schema is not supported, a file is damaged, or the field belongs to other Gaussians. The
+            FileNotFoundError: If the folder does not contain a complete field.
+            ValueError: If the schema is not supported, a file is damaged, or the field belongs to other Gaussians. The
                 message names the file or folder.
         """
         folder = Path(folder)
@@ -300,12 +303,12 @@ def choose_form(
     """Choose the storage form. "auto" selects the smallest form whose bound is within the tolerance.
 
     Args:
-        portion: part of the Gaussians that the lift covers (default: all).
+        portion: Part of the Gaussians that the lift covers (default: all).
     Returns:
         Metadata for the manifest about the chosen form and all compared forms, and the basis if the form is "low_rank".
         "low_rank" is compared only if `storage` allows it and a basis meets the tolerance.
     Raises:
-        ValueError: if the storage is unknown, the tolerance is not positive, or no rank meets it for "low_rank".
+        ValueError: If the storage is unknown, the tolerance is not positive, or no rank meets it for "low_rank".
     """
     if not tolerance > 0:
         raise InputError(f"tolerance must be positive, got {tolerance}")

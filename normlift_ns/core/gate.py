@@ -38,8 +38,8 @@ def sample_pairs(
     The sample and the choice of neighbors depend only on the indices of the Gaussians.
 
     Args:
-        gaussians: index of every row among all n Gaussians.
-        neighbors: neighbors of every row, -1 for none.
+        gaussians: Index of every row among all n Gaussians.
+        neighbors: Neighbors of every row, -1 for none.
     """
     number, share = hash_to_unit(gaussians), min(1.0, _PAIRS / max(1, n))
     row = (number < share).nonzero().squeeze(1)
@@ -54,8 +54,8 @@ def shared_region_cosines(
     """Return <u_i, u_k> of the pairs that share a region in at least half of the views that show both.
 
     Args:
-        first, second: rows of the two Gaussians of every pair.
-        level: level of every region (default: the same for all). A level of a view counts as a view of its own.
+        first, second: Rows of the two Gaussians of every pair.
+        level: Level of every region (default: the same for all). A level of a view counts as a view of its own.
     """
     evidence, norm = lifted.evidence, lifted.scalars.norm
     usable = (norm[first] > 0) & (norm[second] > 0)

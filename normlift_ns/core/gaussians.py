@@ -39,7 +39,7 @@ class GaussianScene(TensorRecord):
     direction and a reliability of 0, and exports omit them.
 
     Raises:
-        ValueError: if a shape, type or device is wrong, a scale is negative, or an opacity is outside 0..1.
+        ValueError: If a shape, type or device is wrong, a scale is negative, or an opacity is outside 0..1.
 
     >>> import torch
     >>> from normlift_ns import GaussianScene
@@ -117,7 +117,7 @@ class Camera:
     """A pinhole camera in the OpenCV convention: x right, y down, z forward, pixel centers at half integers.
 
     Raises:
-        ValueError: if a shape is wrong, the intrinsics are not finite or have skew, the pose is not rigid, or the size
+        ValueError: If a shape is wrong, the intrinsics are not finite or have skew, the pose is not rigid, or the size
             is out of range.
 
     >>> import torch

@@ -36,8 +36,8 @@ def independent_views(
 
     Args:
         view_weights: W_jv, [N, views].
-        centers: camera centers of the views.
-        drift: angle in degrees at which s_vw is 1/e.
+        centers: Camera centers of the views.
+        drift: Angle in degrees at which s_vw is 1/e.
     """
     count = view_weights.offsets.diff()
     out = torch.zeros(len(view_weights), dtype=torch.float64, device=means.device)
@@ -71,7 +71,7 @@ def pair_reliability(norm: Float[Tensor, " n"], views: Float[Tensor, " n"], beta
     Args:
         norm: ||f_j||.
         views: N_j, from `Scalars.n_eff` or `independent_views`.
-        beta: prior strength, in views, >= 0.
+        beta: Prior strength, in views, >= 0.
 
     >>> pair_reliability(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), beta=1.0)
     tensor([0.0200, 0.5100, 0.0000])

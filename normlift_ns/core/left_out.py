@@ -29,7 +29,7 @@ from normlift_ns.core.lift import lift
 from normlift_ns.core.sparse import CHUNK_ELEMENTS, SparseRows, row_offsets
 
 PARTNER_IOU = 0.3
-"""J above which a kept region confirms a left-out region."""
+"""A kept region confirms a left-out region if J, their soft intersection over union, is above this value."""
 
 
 class LeftOut(NamedTuple):
@@ -64,11 +64,11 @@ def leave_views_out(
     The formulas are in the module docstring.
 
     Args:
-        sampled: evidence of the Gaussians from `sample_gaussians`.
-        probability: sampling probability of each row.
+        sampled: Evidence of the Gaussians from `sample_gaussians`.
+        probability: Sampling probability of each row.
         features: F, before the consensus; unit rows or 0.
-        level: level of every region (default: the same for all). Regions of different levels are not compared.
-        power, least: options of the consensus, as in `consensus`. If `least` is None, lift the kept views without a
+        level: Level of every region (default: the same for all). Regions of different levels are not compared.
+        power, least: Options of the consensus, as in `consensus`. If `least` is None, lift the kept views without a
             consensus.
     """
     device = sampled.rows.weight.device
@@ -144,7 +144,10 @@ def _partners(found: Overlaps, kept: Bool[Tensor, " s"], features: Float[Tensor,
 def _nearest_is_own(
     rows: Float[Tensor, "c d"], features: Float[Tensor, "c d"], group: Int64[Tensor, " c"]
 ) -> Bool[Tensor, " c"]:
-    """Return True for each nonzero row that is nearer to its own feature than to the other features of its group."""
+    """Return True for each nonzero row that is nearer to its own feature than to the other features of its group.
+
+    The result is False for the only row of a group.
+    """
     found = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     for one in group.unique().tolist():
         members = (group == one).nonzero().squeeze(1)

@@ -55,7 +55,7 @@ class Scalars(TensorRecord):
     """
 
     norm: Float[Tensor, " n"]
-    """||f_j||, in 0..1."""
+    """||f_j||, the length of the weighted mean of the features, in 0..1."""
     c_intra: Float[Tensor, " n"]
     """Agreement within views, in 0..1."""
     c_inter: Float[Tensor, " n"]
@@ -63,9 +63,9 @@ class Scalars(TensorRecord):
     n_eff: Float[Tensor, " n"]
     """Effective number of views, in 1..view_count, or 0 without evidence."""
     reliability: Float[Tensor, " n"]
-    """R_j, in 0..1."""
+    """Reliability R_j, in 0..1."""
     weight: Float[Tensor, " n"]
-    """W_j, the denominator of f_j."""
+    """W_j, the sum of the Gaussian's weights over all views, by which the sum of its features is divided."""
     view_count: Int32[Tensor, " n"]
     """Number of views in which the Gaussian has weight."""
 
@@ -107,7 +107,7 @@ class Lifted:
         The row of a Gaussian does not depend on which others are requested.
 
         Args:
-            dtype: type of the result (default: that of the features). Half precision also halves the peak memory.
+            dtype: Type of the result (default: that of the features). Half precision also halves the peak memory.
         """
         dtype = dtype or self.features.dtype
         if not dtype.is_floating_point:
@@ -146,14 +146,14 @@ def lift(
 
     Args:
         evidence: E, from `rasterize_evidence`.
-        features: one unit row per column of the evidence. Deviations of the lengths up to 0.01 are corrected.
-        beta: prior strength of the shrinkage of R, as a number of views, >= 0.
+        features: One unit row per column of the evidence. Deviations of the lengths up to 0.01 are corrected.
+        beta: Prior strength of the shrinkage of R, as a number of views, >= 0.
         unlabeled: "ignore" omits unlabeled pixels. "dilute" counts them in every W_jv, as observations of the zero
             vector.
     Returns:
         `Lifted`, in float64 if the evidence or the features are float64, else in float32.
     Raises:
-        ValueError: if `features` has the wrong length, a row is not a unit vector, a weight is outside 0..1e15, or an
+        ValueError: If `features` has the wrong length, a row is not a unit vector, a weight is outside 0..1e15, or an
             option is invalid.
 
     >>> import torch
@@ -198,7 +198,7 @@ def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], b
     Args:
         norm: ||f_j||. With 1, the result is the factor N_eff / (N_eff + beta).
         n_eff: N_eff, or 0 without evidence.
-        beta: prior strength as a number of views, >= 0.
+        beta: Prior strength as a number of views, >= 0.
 
     >>> reliability(0.6, torch.tensor([0.0, 2.0]), beta=1.0)
     tensor([0.0000, 0.4000])
@@ -212,8 +212,8 @@ def norm_of_reliability(scalars: Scalars, beta: float) -> Float64[Tensor, " n"]:
     After a consensus, R_j and therefore the result are those of the features before the consensus.
 
     Args:
-        scalars: scalars of a lift with the paper's R.
-        beta: prior strength, as for `reliability`.
+        scalars: Scalars of a lift with the paper's R.
+        beta: Prior strength, as for `reliability`.
     """
     views = scalars.n_eff.double()
     return torch.where(views > 0, scalars.reliability.double() * (views + beta) / views, 0.0).clamp(max=1)
@@ -287,11 +287,11 @@ def check_unit_rows(
     """Return the lengths of rows, and raise ValueError unless all are unit vectors.
 
     Args:
-        name: name of the rows in the message, for example "feature rows".
-        advice: suggestion for the user in the message.
-        allow_zeros: accept rows of zeros too.
+        name: Name of the rows in the message, for example "feature rows".
+        advice: Suggestion for the user in the message.
+        allow_zeros: Accept rows of zeros too.
     Raises:
-        ValueError: if a row has the wrong length or is not finite. The message gives the number of these rows and up to
+        ValueError: If a row has the wrong length or is not finite. The message gives the number of these rows and up to
             three examples.
 
     >>> check_unit_rows(torch.tensor([[0.6, 0.8]]), "feature rows", "normalize them").round(decimals=6)

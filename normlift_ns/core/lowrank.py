@@ -156,8 +156,8 @@ def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, 
     """Return the directions of all Gaussians with evidence.
 
     Args:
-        basis: vectors of the basis as rows, to store coordinates in it, or None to store full directions.
-        order: indices of all Gaussians from `spatial_order`.
+        basis: Vectors of the basis as rows, to store coordinates in it, or None to store full directions.
+        order: Indices of all Gaussians from `spatial_order`.
     """
     coordinates, gaussians = encode_directions(lifted, basis, order.split(PARTITION_BLOCK))
     return arrange_directions([coordinates], [gaussians], basis, len(order))
@@ -172,7 +172,7 @@ def encode_directions(
     processes.
 
     Args:
-        blocks: rows of the lift that are encoded together.
+        blocks: Rows of the lift that are encoded together.
     """
     dimension = lifted.features.shape[1] if basis is None else len(basis)
     mask, coordinates = lifted.scalars.norm > 0, [lifted.features.new_zeros(0, dimension, dtype=torch.float16)]
@@ -205,7 +205,7 @@ def sizes_and_bounds(
     """Return the size in bytes of each storage form, without scalars and source, and its bound on the cosine error.
 
     Args:
-        portion: part of the Gaussians that the lift covers (default: all).
+        portion: Part of the Gaussians that the lift covers (default: all).
     """
     mask, evidence = lifted.scalars.norm > 0, lifted.evidence
     sizes = torch.stack([mask.sum(), mask.new_tensor(evidence.nnz, dtype=torch.int64), evidence.unlabeled.offsets[-1]])

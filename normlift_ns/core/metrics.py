@@ -41,11 +41,11 @@ def confusion(truth: Int[Tensor, "*m"], predicted: Int[Tensor, "*m"], classes: i
     The last column counts points without a predicted class. Points with a negative true class are ignored.
 
     Args:
-        truth: true classes.
-        predicted: predicted classes, or a negative number for none.
-        classes: number of classes.
+        truth: True classes.
+        predicted: Predicted classes, or a negative number for none.
+        classes: Number of classes.
     Raises:
-        ValueError: if a class is `classes` or larger.
+        ValueError: If a class is `classes` or larger.
 
     >>> confusion(torch.tensor([0, 0, 1, -1]), torch.tensor([0, 1, -1, 1]), 2).tolist()
     [[1, 1, 0], [0, 0, 1]]
@@ -76,8 +76,8 @@ def classify(
     """Return the class with the largest score; ties go to the first class.
 
     Args:
-        valid: mask of the Gaussians with a direction, from `SemanticField.valid`.
-        without_direction: class of the other Gaussians. "none" is `NO_CLASS`, which only lowers scores of the true
+        valid: Mask of the Gaussians with a direction, from `SemanticField.valid`.
+        without_direction: Class of the other Gaussians. "none" is `NO_CLASS`, which only lowers scores of the true
             class. "first" is class 0, the arg-max of a zero feature in published scripts. It adds false positives to
             this class, which is wall in ScanNet.
     """
@@ -89,7 +89,7 @@ def mask_iou(predicted: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, empt
     """Return |predicted and truth| / |predicted or truth|, in 0..1.
 
     Args:
-        empty: result for two empty masks (default: NaN). SFS's code uses 0.
+        empty: Result for two empty masks (default: NaN). SFS's code uses 0.
     """
     union = int((predicted | truth).sum())
     return int((predicted & truth).sum()) / union if union > 0 else empty
@@ -105,7 +105,7 @@ def localized(score: Float[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, any_pe
     """Return True if the pixel with the largest score is in the mask.
 
     Args:
-        any_peak: accept any of several pixels with the largest score (default: only the first in row-major order).
+        any_peak: Accept any of several pixels with the largest score (default: only the first in row-major order).
     """
     peak = score == score.max()
     if any_peak:
@@ -148,7 +148,7 @@ def bin_means(
     """Return the means of keys and values in bins of equal count, by ascending key. Ties are ordered by index.
 
     Raises:
-        ValueError: if there are fewer points than bins.
+        ValueError: If there are fewer points than bins.
     """
     if len(key) < bins:
         raise InputError(f"{bins} bins need at least one point each, got {len(key)} points")

@@ -71,11 +71,11 @@ def nearest_neighbors(
 
     Args:
         of: Gaussians to find neighbors for, one per row of the result (default: all n).
-        progress: callback after every block of Gaussians, with the number that are done and their total.
-        team: processes that call this function together, each for a part of the same Gaussians (default: only this
+        progress: Callback after every block of Gaussians, with the number that are done and their total.
+        team: Processes that call this function together, each for a part of the same Gaussians (default: only this
             process).
     Raises:
-        ValueError: if `k` is less than 1 or more than `MAX_NEIGHBORS`.
+        ValueError: If `k` is less than 1 or more than `MAX_NEIGHBORS`.
 
     >>> import torch
     >>> from normlift_ns import nearest_neighbors
@@ -204,10 +204,10 @@ def _rank_gaussians(
 
     Args:
         member: Gaussians at every position, from `_members`.
-        queries: indices of the positions to search from.
-        near: indices of the nearest positions of every query, nearest first.
-        reach: distances to `near`.
-        count: number of Gaussians per query. Shorter rows are padded with -1.
+        queries: Indices of the positions to search from.
+        near: Indices of the nearest positions of every query, nearest first.
+        reach: Distances to `near`.
+        count: Number of Gaussians per query. Shorter rows are padded with -1.
     """
     slots = member.shape[1]
 

@@ -26,7 +26,7 @@ def with_null_level(field: SemanticField, vectors: Float[Tensor, "m d"]) -> Sema
     """Return a field with null levels, and with the top cosine of every null text in its manifest.
 
     Args:
-        vectors: one vector per text of the null vocabulary, M >= 2, of any norm > 0.
+        vectors: One vector per text of the null vocabulary, M >= 2, of any norm > 0.
     """
     count = max(2, round(NULL_SHARE * len(vectors)))
     own, source = field.valid(refined=False), field.source.long()

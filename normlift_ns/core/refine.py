@@ -61,7 +61,7 @@ def refine(
     regions. If R_i = 0, S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
 
     Args:
-        config: options of the vote (default: the posterior vote with `own`, else the paper's vote).
+        config: Options of the vote (default: the posterior vote with `own`, else the paper's vote).
         directions: u, unit rows or 0 of any floating-point type. Float64 rows are used in float64, others in float32.
             If `directions` is a function of indices, such as `Lifted.directions`, only one block is in memory at a
             time.
@@ -69,11 +69,11 @@ def refine(
         own: `Lifted.scalars.own_evidence`, required by the posterior vote and ignored by the paper's vote.
         labeled: `labeled_share` of the evidence. Gaussians below `config.min_labeled` keep their direction (default:
             all may change).
-        neighbors: result of `nearest_neighbors(means, config.k)`, to share one search among several votes (default:
+        neighbors: Result of `nearest_neighbors(means, config.k)`, to share one search among several votes (default:
             search for the K of `clamp_k(config, n)`).
-        progress: callback after every block of Gaussians, with the number that are done and their total.
+        progress: Callback after every block of Gaussians, with the number that are done and their total.
     Raises:
-        ValueError: if shapes disagree, a direction is neither a unit vector nor 0, `reliability` or `own` is invalid,
+        ValueError: If shapes disagree, a direction is neither a unit vector nor 0, `reliability` or `own` is invalid,
             or `own` is missing.
 
     >>> import torch
@@ -155,11 +155,11 @@ def refine_subset(
 
     Args:
         voters: Gaussians to refine, block by block in this order. Neighbors in space should be close in this order.
-        neighbors: neighbors of the first m Gaussians, which include all voters.
-        directions, reliability: as in `refine`, for all n Gaussians.
-        own: as in `refine`, used for voters only, or None for the paper's vote.
+        neighbors: Neighbors of the first m Gaussians, which include all voters.
+        directions, reliability: As in `refine`, for all n Gaussians.
+        own: As in `refine`, used for voters only, or None for the paper's vote.
         width: sigma_d, in the units of the distances.
-        progress: as in `refine`.
+        progress: As in `refine`.
     """
     n, device, on_gpu = len(reliability), reliability.device, can_use_triton(reliability)
     inputs = _VoteInputs(neighbors, reliability, own, config, width)
@@ -311,7 +311,7 @@ def _decay(r: Tensor, square: Tensor) -> Tensor:
 def _margin(
     neighbors: Neighbors, width: Tensor, rows: Int[Tensor, " m"], reliability: Tensor, delta: float
 ) -> Float64[Tensor, " m"] | float:
-    """Return Delta times the factor of `voting_weights`, or infinity if no member is reliable."""
+    """Return Delta times the factor of `voting_weights`. If Delta > 0, it is infinite if no member is reliable."""
     if delta == 0:
         return 0.0
     return delta * torch.exp(0.5 * _nearest(*_within(neighbors, width, rows, reliability)).squeeze(1))

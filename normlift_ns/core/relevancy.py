@@ -111,15 +111,15 @@ def relevancy(
     """Compute the relevancy of Q prompts from cosines.
 
     Args:
-        positive: cosine to each prompt, as a tensor or NumPy array.
-        negative: cosine to each negative (rule "lerf") or background (rule "margin") prompt.
+        positive: Cosine to each prompt, as a tensor or NumPy array.
+        negative: Cosine to each negative (rule "lerf") or background (rule "margin") prompt.
         rule: "contrast" is "lerf" with a null level [..., 1] as the only negative. "cosine" is the cosine itself, in
             -1..1. "lerf" is the smallest softmax of the prompt against one negative, in 0..1 (LERF, section 3.4). At
             0.5, prompt and negative are equally similar. "margin" is the cosine minus the largest background cosine,
             in -2..2.
-        temperature: factor of the cosines inside the softmax, > 0.
+        temperature: Factor of the cosines inside the softmax, > 0.
     Raises:
-        ValueError: if a value is not in -1..1, the rule is unknown, or the rule needs negatives and none are given.
+        ValueError: If a value is not in -1..1, the rule is unknown, or the rule needs negatives and none are given.
 
     >>> import torch
     >>> from normlift_ns import relevancy
@@ -165,7 +165,7 @@ def gaussian_relevancy(
     """Compute the relevancy of Gaussians. Those without a direction (not `valid`) get `no_direction` of the rule.
 
     Raises:
-        ValueError: if the rule is unknown, or if it needs negatives and none are given.
+        ValueError: If the rule is unknown, or if it needs negatives and none are given.
     """
     values = _relevancy(positive, negative, rule, TEMPERATURE)
     return _namespace(values).where(valid[:, None], values, RELEVANCY_RULES[rule].no_direction)

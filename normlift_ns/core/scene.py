@@ -76,7 +76,7 @@ class Views(Protocol):
         """Read one image.
 
         Raises:
-            FileNotFoundError, ValueError: if the file is missing or cannot be read. The message names the file.
+            FileNotFoundError, ValueError: If the file is missing or cannot be read. The message names the file.
         """
         ...
 
@@ -165,7 +165,7 @@ class Scene(Protocol):
 
 
 def camera_summary(cameras: Sequence[Camera]) -> list[float]:
-    """Return a summary of cameras for a manifest, which depends on every camera and on their order.
+    """Return a summary of cameras for a manifest. It depends on every camera and on their order.
 
     It consists of the number of cameras and weighted means of size, intrinsics and pose. Weights increase from 1 to 2.
 

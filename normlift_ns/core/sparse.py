@@ -108,7 +108,7 @@ class SparseRows(TensorRecord):
         """Smallest number of columns that contains all entries.
 
         Raises:
-            ValueError: if the arrays do not form a valid matrix, which could cause out-of-bounds memory access.
+            ValueError: If the arrays do not form a valid matrix. Such arrays could cause out-of-bounds memory access.
         """
         size, lengths = self.column.numel(), self.offsets.diff()
         ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.numel() > 0 else []

@@ -55,7 +55,7 @@ def measure_alignment(
 
     Args:
         scene: Gaussians, cameras and images.
-        settings: constants of the rasterizer at the original image size. None: the constants that the scene records.
+        settings: Constants of the rasterizer at the original image size. None: the constants that the scene records.
         device: torch device to render on.
         explain: True to look for a better lens or primitive in any case. False to skip this search if the PSNR or the
             margin is below the usual minimum.
@@ -84,7 +84,7 @@ def measure_alignment(
 def _compare(
     gaussians: GaussianScene, views: Sequence[ReducedView], renders: Sequence[UInt8[Tensor, "h w 3"]]
 ) -> Alignment:
-    """Return the agreement of views with their renders, without its causes."""
+    """Return the agreement of views with their renders, without a `cause`."""
     visible = max(float(in_frustum(gaussians.means, small.view.camera).float().mean()) for small in views)
     psnrs = {small.view.name: small.psnr(image) for small, image in zip(views, renders)}
     worst = min(psnrs, key=lambda name: psnrs[name])

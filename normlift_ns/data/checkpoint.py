@@ -370,7 +370,7 @@ class _Rank(NamedTuple):
 
     step: int
     parameters: dict[str, Tensor]
-    """Parameters by splatfacto's names."""
+    """Parameters of the Gaussians, by the names that splatfacto uses."""
     pose_adjust: Float[Tensor, "v 9"] | None
     remarks: tuple[str, ...]
     """Messages about parameters that are ignored."""

@@ -124,7 +124,7 @@ class ColmapImage(NamedTuple):
     image_id: int
     name: str
     rotation: list[float]
-    """Quaternion w, x, y, z."""
+    """Rotation from world to camera, as a quaternion (w, x, y, z)."""
     translation: list[float]
     camera_id: int
 

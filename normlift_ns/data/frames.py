@@ -242,7 +242,8 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
 
 
 def check_lens_types(frames: Sequence[Frame], source: Path) -> None:
-    """Raise InputError if some frames have fisheye cameras and others do not, which a nerfstudio run cannot store."""
+    """Raise InputError if only some of the frames have fisheye cameras, because a nerfstudio run cannot store both
+    kinds."""
     first = {frame.intrinsics.fisheye: frame.name for frame in reversed(frames)}
     if len(first) > 1:
         raise InputError(

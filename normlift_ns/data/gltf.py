@@ -303,7 +303,7 @@ def _read_accessor(gltf: _Gltf, index: int, name: str, size: int) -> Float[np.nd
 
 
 def _find_accessor(gltf: _Gltf, index: int, name: str, size: int) -> tuple[_Accessor, str]:
-    """Return a dense accessor of rows of `size` numbers, and the type of these numbers."""
+    """Return a dense accessor that has rows of `size` numbers, and the type of the numbers."""
     accessors = gltf.document.accessors
     accessor = accessors[index] if 0 <= index < len(accessors) else None
     if accessor is not None and (accessor.sparse is not None or accessor.buffer_view is None):

@@ -14,7 +14,7 @@ from normlift_ns.io.guard import read_text
 from normlift_ns.options import Primitive, RasterizeMode
 
 _NAMES = ("cfg.yml", "cfg.json")
-"""Names of the file. simple_trainer_2dgs.py writes a .json file, which is also valid YAML."""
+"""Possible names of the settings file. simple_trainer_2dgs.py writes a .json file, which is also valid YAML."""
 _MAX_BYTES = 2**18
 _FOLDERS = ("ckpts", "ply")
 _OF_3DGUT = ("with_ut", "with_eval3d")
@@ -39,7 +39,7 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     Returns:
         The settings, or None if there is no cfg.yml of gsplat's trainer.
     Raises:
-        ValueError: if the file is damaged, or the splat was not trained as 3D or 2D Gaussians with pinhole cameras.
+        ValueError: If the file is damaged, or the splat was not trained as 3D or 2D Gaussians with pinhole cameras.
     """
     folder = splat.parent.parent if splat.parent.name in _FOLDERS else splat.parent
     path = next((folder / name for name in _NAMES if (folder / name).is_file()), None)

@@ -108,12 +108,12 @@ def explain_misfit(
     Changes of the lens are tried by warping the images, so nothing is rendered.
 
     Args:
-        views: views of the images.
-        renders: render of each view.
-        render_flat: function that renders a view as 2D Gaussians. If None, the renders are good enough, and only small
+        views: Reduced views of the images.
+        renders: Render of each view.
+        render_flat: Function that renders a view as 2D Gaussians. If None, the renders are good enough, and only small
             changes of the lens are tried.
         min_psnr: PSNR in dB that the change must reach.
-        min_margin: lead in dB over the PSNR of the mean color that the change must reach.
+        min_margin: Lead in dB over the PSNR of the mean color that the change must reach.
     """
     levels = [[_pair(small.reduced(side), small, image) for small, image in zip(views, renders)] for side in _SIDES]
     before = _mean(levels[-1], Lens())[0]

@@ -50,7 +50,7 @@ def open_splat(
         path: A plain or compressed PLY file, an SPZ, .splat, GLB or glTF file, or ckpt_<step>_rank<r>.pt of gsplat's
             simple_trainer. The format is detected from the first bytes. Installed packages may add formats by suffix.
         options: Paths of the cameras and images, and settings of the splat.
-        device: auto, cpu or cuda; device of the renders that find the world.
+        device: Device of the renders that find the world: auto, cpu or cuda.
         say: Function that is called with one sentence per assumption, for example `print`.
     Raises:
         FileNotFoundError: A file or image is missing.
@@ -262,7 +262,7 @@ def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> Splat
     """Return the file with a known primitive, from the options, the files or the file name, in this order.
 
     Raises:
-        ValueError: if options and files contradict each other.
+        ValueError: If options and files contradict each other.
     """
     named: Primitive = "2dgs" if "2dgs" in path.name.lower() else "3dgs"
     if options.primitive is not None and file.primitive not in (None, options.primitive):

@@ -60,9 +60,9 @@ class ReducedView(NamedTuple):
         """Render the scene so that it looks like a downscaled render at full size.
 
         Args:
-            scene: the scene.
-            gaussians: its Gaussians on the rendering device.
-            settings: constants of the rasterizer at full size.
+            scene: Scene to render.
+            gaussians: Gaussians of the scene, on the rendering device.
+            settings: Constants of the rasterizer at full size.
         """
         as_trained = self.divisor < _MAX_DIVISOR_AS_TRAINED
         if gaussians.primitive == "2dgs" and self.divisor > 1:  # as thin 3D Gaussians, whose blur can be reduced
@@ -77,7 +77,7 @@ def sample_views(scene: Scene) -> list[ReducedView]:
     """Return the first, the middle and the last training view, with at most 400 pixels on the longer side.
 
     Raises:
-        FileNotFoundError, ValueError: if an image is missing or cannot be read, or the masks leave no pixels.
+        FileNotFoundError, ValueError: If an image is missing or cannot be read, or the masks leave no pixels.
     """
     last = len(scene.train) - 1
     views = [ReducedView(scene.train[index], 1.0).reduced(_MAX_SIDE) for index in sorted({0, last // 2, last})]

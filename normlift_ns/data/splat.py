@@ -66,7 +66,7 @@ class SplatParameters:
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """Tensors by splatfacto's names."""
+        """Tensors of all parameters, by the names that splatfacto uses."""
         return {name: getattr(self, name) for name in GAUSSIAN_PARAMETERS}
 
     @property

@@ -31,7 +31,7 @@ _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE_OFFSET, _TABLE_ENTRY = struct.Struct("<16xI12x"), struct.Struct("<QQ")
 """Header of version 4 with the offset of the table, and table entry with the compressed and uncompressed size."""
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
-"""Bits of the flags."""
+"""Bits of the flags in a header: antialiased Gaussians, and extensions in the file."""
 _MAX_FRACTIONAL_BITS, _MAX_FIXED = 23, 2**23 - 1
 _COLOR_SCALE, _SCALE_STEPS, _MIN_SCALE = 0.15, 16, -10
 _SH_STEPS = (8, 16)

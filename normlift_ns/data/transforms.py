@@ -370,7 +370,10 @@ def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrins
 def _readings(
     entry: CameraEntry, start: str, names: Sequence[str], lens: Intrinsics
 ) -> Iterator[tuple[str, str, float]]:
-    """Yield the name, key in the file and value of each given parameter, with angles converted to pixels."""
+    """Yield the name, key in the file and value of each given parameter.
+
+    Angles of view are converted to focal lengths in pixels.
+    """
     for name, value in _given(entry, *names):
         if name.startswith("camera_angle"):
             if 0 < value < math.pi:
@@ -445,7 +448,7 @@ def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path:
 
 
 def _focal(focal: float | None, angle: float | None, side: float) -> float | None:
-    """Return the focal length in pixels, computed from the angle of view in radians if it is None."""
+    """Return the focal length in pixels. If `focal` is None, compute it from the angle of view in radians."""
     return 0.5 * side / math.tan(0.5 * angle) if focal is None and angle is not None else focal
 
 

@@ -60,7 +60,8 @@ class _Points(NamedTuple):
     views: list[View]
 
     def agreement(self, worlds: Sequence[_Motion]) -> Float[Tensor, " w"]:
-        """Return the mean correlation in -1..1 of the images with the visible points, for cameras in other worlds."""
+        """Return the mean correlation in -1..1 of the images with the visible points, for cameras in each of the
+        worlds."""
         values = torch.zeros(len(worlds))
         for view in self.views:
             poses = torch.stack([world.move(view.camera.world_to_camera) for world in worlds])
@@ -94,7 +95,7 @@ class _Points(NamedTuple):
 
 
 def _centered(image: Float[Tensor, "b c h w"], used: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "b c h w"]:
-    """Return the difference from the mean color of the pixels with weight 1; 0 at those with weight 0."""
+    """Subtract the mean color of the pixels with weight 1 from an image, and set the pixels with weight 0 to 0."""
     return (image - (image * used).sum(dim=(2, 3), keepdim=True) / used.sum().clamp(min=1)) * used
 
 
@@ -120,8 +121,8 @@ class _Search:
     """Comparison of candidate worlds with the images of a scene.
 
     Args:
-        scene: the scene in one of the worlds.
-        here: the world of `scene`.
+        scene: The scene in one of the worlds.
+        here: The world of `scene`.
         device: torch device to render on.
     """
 
@@ -218,7 +219,7 @@ def _rounded(scale: float) -> float:
 
 
 def _likely(agreement: Float[Tensor, " w"]) -> list[int]:
-    """Return the indices of the worlds that agree nearly as well as the best one, which is first."""
+    """Return the indices of the worlds that agree nearly as well as the best world, starting with the best."""
     values, order = agreement.sort(descending=True)
     return order[values >= _LIKELY * values[0].clamp(min=1e-6)][:_MAX_LIKELY].tolist()
 
@@ -283,10 +284,10 @@ def find_world(
     fits, or in the first world if none or several fit.
 
     Args:
-        candidates: possible worlds.
-        scene_in: function that returns the scene in a world.
+        candidates: Possible worlds.
+        scene_in: Function that returns the scene in a world.
         device: torch device to render on.
-        say: function that is called with a sentence if another world fits.
+        say: Function that is called with a sentence if another world fits.
     """
     here = candidates[0]
     scene = scene_in(here)

@@ -36,7 +36,7 @@ _TURNS = {
     "a quarter turn about x, from z up to y up": _Y_DOWN_TO_Z_UP,
     "an exchange of x and y with z reversed": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
 }
-"""Rotations between the axes of tools. Old versions of ns-process-data applied the last one."""
+"""Rotations between the axis conventions of tools. Old versions of ns-process-data applied the last one."""
 _OPENCV_AXES = np.array([1.0, -1, -1, 1])
 
 
@@ -91,7 +91,7 @@ def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile
     OpenCV's axes.
 
     Raises:
-        FileNotFoundError, ValueError: if the world that the options state cannot be read or computed.
+        FileNotFoundError, ValueError: If the world that the options state cannot be read or computed.
     """
     if isinstance(options.world_transform, Path):
         world = read_world_transform(options.world_transform, cameras.applied_transform, cameras.applied_scale)

@@ -205,9 +205,9 @@ class EvidenceShard:
     """
 
     rows: list[CooEntries]
-    """Labeled entries for each process."""
+    """Entries of labeled pixels, by the process that owns their Gaussians."""
     unlabeled: list[CooEntries]
-    """Unlabeled entries for each process."""
+    """Entries of unlabeled pixels, by the process that owns their Gaussians."""
     metadata: tuple[list[int], int, int, int]
     """Number of regions of each view, `weight_power`, `num_excluded`, and bytes per weight."""
 

@@ -255,7 +255,10 @@ def _connect(rank: int, size: int, backend: str, log: Callable[[str], None]) -> 
 
 
 def _wait(ready: Callable[[], bool], target: str, log: Callable[[str], None]) -> None:
-    """Wait in Python, so that signals can interrupt it; raise TimeoutError at the time limit."""
+    """Wait until `ready` returns True; raise TimeoutError at the time limit.
+
+    The loop runs in Python, so that signals can interrupt it.
+    """
     start_time, warned = time.monotonic(), False
     while not ready():
         waited = time.monotonic() - start_time

@@ -89,7 +89,7 @@ class NetworkEncoder(ABC):
     @cached_property
     @abstractmethod
     def _identity(self) -> dict[str, Any]:
-        """See `identity`."""
+        """Value of `identity`. Subclasses must override it."""
 
     @property
     def why_not_dense(self) -> str | None:

@@ -33,7 +33,7 @@ class ModelFamily:
     """A family of networks with the same training and preprocessing."""
 
     name: str
-    """Value of `--encoder`."""
+    """Value of `--encoder` that selects the family."""
     title: str
     """Name of the family in messages."""
     model_types: tuple[str, ...]

@@ -42,7 +42,7 @@ from normlift_ns.options import MissingFeatures
 from normlift_ns.segmentation.regions import resample_nearest
 
 LANGSPLAT_LEVELS = ("default", "s", "m", "l")
-"""Channels of a segment map."""
+"""Names of the channels of a segment map, in order."""
 _MAX_EXACT_HALF = 2048
 """Largest integer up to which half precision represents all integers exactly."""
 _MIN_LENGTH = 1e-30
@@ -210,7 +210,7 @@ class LangSplat:
 
     @cached_property
     def folder(self) -> Path:
-        """Folder that contains the files."""
+        """Folder that contains the files of the images: `root`, or a folder inside it."""
         folders = [self.root, self.root / _NESTED, self.root / _NESTED / _NESTED]
         for folder in folders:
             if os.path.isdir(folder) and next(folder.glob("*_s.npy"), None) is not None:

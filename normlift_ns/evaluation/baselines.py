@@ -62,7 +62,7 @@ def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> Semanti
     """Lift a run again with a baseline, and return the field on the CPU without refinement.
 
     Raises:
-        ValueError, FileNotFoundError: if the features of the run are not available (see `lifted_batches`).
+        ValueError, FileNotFoundError: If the features of the run are not available (see `lifted_batches`).
     """
     evidence, features, _ = _observe_again(lifted, device, _CELL_EVIDENCE[name])
     options = lifted.field.manifest.get("options", {})
@@ -82,7 +82,7 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
     If the run has the other setting, it is lifted again from its regions and features, without refinement.
 
     Raises:
-        ValueError, FileNotFoundError: if the features of the run are not available (see `lifted_batches`).
+        ValueError, FileNotFoundError: If the features of the run are not available (see `lifted_batches`).
     """
     manifest = lifted.field.manifest
     options = manifest.get("options", {})
@@ -119,11 +119,11 @@ def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None =
     """Yield cameras, labels and features of the views of the lift, a few views at a time.
 
     Args:
-        device: device of the networks.
-        max_views: largest number of views, evenly spaced (default: all views of the lift).
+        device: Device of the networks.
+        max_views: Largest number of views, evenly spaced (default: all views of the lift).
     Raises:
-        ValueError: if the run does not record its features, or the features came from a Python object or have changed.
-        FileNotFoundError: if files of the features are missing.
+        ValueError: If the run does not record its features, or the features came from a Python object or have changed.
+        FileNotFoundError: If files of the features are missing.
     """
     manifest, scene = lifted.field.manifest, lifted.scene
     source = restore_source(manifest, device)
@@ -166,7 +166,7 @@ def center_evidence(
     The weight is that of the Gaussian in the view.
 
     Args:
-        columns: column of every pixel in the evidence, for each view, or a negative number for none.
+        columns: Column of every pixel in the evidence, for each view, or a negative number for none.
     """
     weights = evidence.view_weights()
     row, view = weights.row_index(), weights.column.long()
@@ -192,9 +192,9 @@ def top_evidence(
     """Return evidence as in Dr.Splat, which uses only the `top` Gaussians with the largest weights of every ray.
 
     Args:
-        rasterize: function that computes evidence from cameras and labels.
-        columns: as in `center_evidence`.
-        evidence: evidence whose rows are replaced.
+        rasterize: Function that computes evidence from cameras and labels.
+        columns: As in `center_evidence`.
+        evidence: Evidence whose rows are replaced.
     """
     device, size = evidence.rows.weight.device, evidence.num_gaussians
     parts = []
@@ -250,7 +250,7 @@ def iter_medians(
 
 
 def _visible(row: Tensor, view: Tensor, weight: Tensor, count: int, views: int) -> Bool[Tensor, " nnz"]:
-    """Select the entries of views with at least `VISIBLE` times the largest weight of the Gaussian in a view."""
+    """Select the entries of views in which a Gaussian has at least `VISIBLE` times its largest weight in any view."""
     keys, group = (row * views + view).unique(return_inverse=True)
     view_weight = weight.new_zeros(len(keys)).index_add_(0, group, weight)
     heaviest = weight.new_zeros(count).scatter_reduce_(0, keys // views, view_weight, "amax")
@@ -281,8 +281,8 @@ def dense_sums(
     backward pass per 32 channels.
 
     Args:
-        maps: feature B_i of every pixel, for each view.
-        dimension: number of feature channels D.
+        maps: Feature B_i of every pixel, for each view.
+        dimension: Number of feature channels D.
     """
     forward, backward = compiled_rasterizer()
     total = torch.zeros(len(job.scene), dimension, device=job.scene.means.device)
@@ -321,7 +321,7 @@ def time_dense_lift(lifted: EvaluatedRun, device: str) -> dict[str, float]:
     The time of SFS's method is also extrapolated to all views of the lift.
 
     Raises:
-        ValueError, FileNotFoundError: if the features of the run are not available (see `lifted_batches`).
+        ValueError, FileNotFoundError: If the features of the run are not available (see `lifted_batches`).
     """
     blocks = list(lifted_batches(lifted, device, max_views=_TIMED_VIEWS))
     job = _job(lifted, device)

@@ -77,7 +77,7 @@ def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], s
     """Return the names of the lifted images, and of the images without features.
 
     Raises:
-        ValueError: if the manifest does not record them, or the scene no longer has some of the lifted images.
+        ValueError: If the manifest does not record them, or the scene no longer has some of the lifted images.
     """
     names = list(scene.train.names)
     try:
@@ -105,7 +105,7 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
     """Return at most `MAX_IMAGES` lifted and `MAX_IMAGES` other images of a scene, evenly spaced.
 
     Raises:
-        ValueError: if the manifest does not record the lifted images, or the scene no longer has some of them.
+        ValueError: If the manifest does not record the lifted images, or the scene no longer has some of them.
     """
     used, unusable = lifted_names(scene, manifest)
     train, held_out = (list(zip(views.names, views.cameras)) for views in (scene.train, scene.held_out))
@@ -135,9 +135,9 @@ class WeakRegion:
     """Connected visible Gaussians with little reliable evidence. Means are weighted by surface."""
 
     size: int
-    """Number of Gaussians."""
+    """Number of Gaussians in the region."""
     centre: list[float]
-    """Center in scene units."""
+    """Center of the region as x, y and z, in scene units."""
     box: dict[str, list[float]]
     """Corners "min" and "max" of the bounding box of the centers, in scene units."""
     share: float
@@ -330,7 +330,7 @@ def model_of_lift(
     different resolution and several levels of regions.
 
     Args:
-        lifted: weights of the lifted views, [N, views].
+        lifted: Weights of the lifted views, [N, views].
     """
     sums, norm = lifted.row_sums(), scalars.norm.double()
     valid = (norm > 0) & (sums > 0) & (scalars.n_eff > 0)
@@ -362,7 +362,7 @@ def choose_views(
 
     Args:
         views: W_jv of the candidates, [N, count].
-        accept: function that returns True if a view may be chosen (default: all views).
+        accept: Function that returns True if a view may be chosen (default: all views).
     """
     chosen: list[tuple[int, float]] = []
     for _ in range(min(max_views, count)):
@@ -543,7 +543,7 @@ def suggest_poses(
     """Suggest poses for the regions, chosen greedily by their gain.
 
     Args:
-        targets: centers of the regions.
+        targets: Centers of the regions.
         parts: Gaussians of the regions.
     """
     if len(parts) == 0:
@@ -636,11 +636,11 @@ def write_poses(
     On an error, none of the files is written.
 
     Args:
-        documents: additional JSON files for the same folder.
-        overwrite: replace existing files, and remove those of an earlier study.
+        documents: Additional JSON files for the same folder.
+        overwrite: Replace existing files, and remove those of an earlier study.
     Raises:
-        FileExistsError: if a file exists and `overwrite` is False.
-        OSError: if the files cannot be written.
+        FileExistsError: If a file exists and `overwrite` is False.
+        OSError: If the files cannot be written.
     """
     path, *images = pose_output_paths(stem)
     json_files = dict(documents or {})
@@ -736,11 +736,11 @@ class Coverage:
         `ns-render camera-path` renders the camera path with the run.
 
         Args:
-            overwrite: replace existing files.
+            overwrite: Replace existing files.
         Raises:
-            FileExistsError: if a file exists and `overwrite` is False.
-            ValueError: if the path is not a file name, or a file of the run would be replaced.
-            OSError: if the files cannot be written.
+            FileExistsError: If a file exists and `overwrite` is False.
+            ValueError: If the path is not a file name, or a file of the run would be replaced.
+            OSError: If the files cannot be written.
 
         >>> from normlift_ns import coverage, open_run
         >>> [path.name for path in coverage(open_run(config)).save(folder / "next.json")][:2]
@@ -763,10 +763,10 @@ def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str |
     the reliability with one more view, by the formula in `evaluation.coverage`.
 
     Args:
-        min_reliability: smallest R of a reliable Gaussian, in 0..1.
-        device: device for the rasterization (default: that of the run).
+        min_reliability: Smallest R of a reliable Gaussian, in 0..1.
+        device: Device for the rasterization (default: that of the run).
     Raises:
-        ValueError: if the run does not record the lifted images, or no Gaussian is visible in the images.
+        ValueError: If the run does not record the lifted images, or no Gaussian is visible in the images.
 
     >>> from normlift_ns import coverage, open_run
     >>> run = open_run(config)

@@ -73,7 +73,7 @@ def read_frames(folder: Path) -> list[Path]:
     """Return the JSON files of a folder such as lerf_ovs/label/figurines, sorted by name.
 
     Raises:
-        FileNotFoundError: if the folder does not exist or has no JSON files.
+        FileNotFoundError: If the folder does not exist or has no JSON files.
     """
     files = sorted(folder.glob("*.json")) if os.path.isdir(folder) else []
     if len(files) == 0:
@@ -87,7 +87,7 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
     """Read a label file, and fill its polygons after scaling them to the size of the image.
 
     Raises:
-        ValueError: if the file has the wrong format, or labels an image with a different aspect ratio. The message
+        ValueError: If the file has the wrong format, or labels an image with a different aspect ratio. The message
             names the file.
     """
     try:
@@ -143,7 +143,7 @@ def match_views(files: Sequence[Path], names: Sequence[str]) -> tuple[dict[Path,
     Returns:
         The image of every label file with an image, and the stems of the other label files.
     Raises:
-        ValueError: if no label file has an image, or a label file has several images.
+        ValueError: If no label file has an image, or a label file has several images.
     """
     images: dict[str, list[str]] = {}
     for name in names:
@@ -200,8 +200,8 @@ def prompt_mask(
             above SFS's threshold, from their histogram and the number of true instances. "langsplat" and
             "langsplat_composited" scale the relevancy to 0..1 over the image. They select a pixel if most pixels around
             it exceed 0.7, which LangSplat writes as 2 x - 1 > 0.4.
-        margin: lead over the background words, in cosine.
-        instances: number of true instances.
+        margin: Lead over the background words, in cosine.
+        instances: Number of true instances.
     """
     if masking == "background":
         return score > background.max(dim=2).values + margin
@@ -283,7 +283,7 @@ def summarize_lerf(rows: Sequence[dict[str, Any]], average: AveragingOrder, sett
     Results with the suffix _pooled are averages over the frames, pairs or categories of all scenes.
 
     Args:
-        rows: results of `frame_rows`, each with its scene.
+        rows: Results of `frame_rows`, each with its scene.
         average: "frames" averages over the categories of a frame, then over frames (SFS's code). "pairs" averages over
             all pairs of frame and category (LangSplat's). "categories" averages over the frames of a category, then
             over categories.
@@ -324,7 +324,7 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
     """Run protocol lerf with one run per scene.
 
     Raises:
-        FileNotFoundError, ValueError: if labels are missing, are damaged, or belong to other images.
+        FileNotFoundError, ValueError: If labels are missing, are damaged, or belong to other images.
     """
     files = [read_frames(folder) for folder in labels]
     rows, missing = [], []

@@ -104,7 +104,7 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
     """Read a JSON file and convert it to a type.
 
     Raises:
-        ValueError: if the file is missing, too large or not valid JSON, a key is duplicated, or a value has the wrong
+        ValueError: If the file is missing, too large or not valid JSON, a key is duplicated, or a value has the wrong
             type.
     """
     try:
@@ -164,9 +164,9 @@ def write_evaluation(
     The keys settings, scenes, rows, studies and comparison are additional. NaN is written as null.
 
     Args:
-        runs: name and checkpoint of every run.
+        runs: Name and checkpoint of every run.
     Raises:
-        FileExistsError: if the file exists and `overwrite` is False.
+        FileExistsError: If the file exists and `overwrite` is False.
     """
     names, checkpoints = (", ".join(values) for values in zip(*runs))
     document: dict[str, Any] = {"experiment_name": names, "method_name": "normlift", "checkpoint": checkpoints}

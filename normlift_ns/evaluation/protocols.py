@@ -56,8 +56,8 @@ def read_names(path: Path) -> Names:
     Values with the same name belong to the same class.
 
     Raises:
-        FileNotFoundError: if the file does not exist.
-        ValueError: if the file has the wrong format.
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file has the wrong format.
     """
     expected = 'expected {"labels": {"1": "table", ...}}'
     if not os.path.lexists(path):
@@ -85,7 +85,7 @@ def read_classes(masks: LabelFiles, name: str, names: Names, height: int, width:
     """Return the class of every pixel of an image, or -1 for pixels to ignore.
 
     Raises:
-        FileNotFoundError, ValueError: if the mask is missing, is damaged, or has the wrong size. The message names the
+        FileNotFoundError, ValueError: If the mask is missing, is damaged, or has the wrong size. The message names the
             file.
     """
     values = masks.values(name)
@@ -108,8 +108,8 @@ def gaussian_truth(
     A Gaussian below either minimum has class -1.
 
     Args:
-        purity: smallest share of the class in the weight of the Gaussian, which includes ignored pixels.
-        min_weight: smallest weight over all views, in pixels.
+        purity: Smallest share of the class in the weight of the Gaussian, which includes ignored pixels.
+        min_weight: Smallest weight over all views, in pixels.
     """
     columns = torch.arange(evidence.num_regions) % classes
     by_class = evidence.rows.matmul(torch.nn.functional.one_hot(columns, classes).to(evidence.rows.weight))
@@ -130,7 +130,7 @@ def evaluate_masks(
     """Compute miou_3d and macc_3d over Gaussians, and miou_2d and macc_2d over all pixels of the held-out views.
 
     Args:
-        pixels: true and predicted classes of every held-out view.
+        pixels: True and predicted classes of every held-out view.
     """
     classes = len(names)
     of_gaussians = class_scores(confusion(truth, prediction, classes))
@@ -195,7 +195,7 @@ class EvaluatedRun:
         """Return the length of the composited feature vector of every pixel, for each camera.
 
         Args:
-            factor: number that multiplies each direction before compositing.
+            factor: Number that multiplies each direction before compositing.
         """
         squares = [torch.zeros(camera.height, camera.width, dtype=torch.float64) for camera in cameras]
         for axes in torch.eye(self.field.dimension).split(_CHANNELS):
@@ -253,9 +253,9 @@ def mask_truth(
     """Derive the ground truth of Gaussians and of held-out pixels from instance masks.
 
     Args:
-        settings: rasterizer settings (default: those of gsplat 1.4).
+        settings: Rasterizer settings (default: those of gsplat 1.4).
     Raises:
-        FileNotFoundError, ValueError: if masks or names are missing or damaged. The message names the file.
+        FileNotFoundError, ValueError: If masks or names are missing or damaged. The message names the file.
     """
     undistort = label_undistortion(scene.train, scene.held_out)
     masks = LabelFiles(folder, undistort=undistort, description="instance mask", flag="--labels")

@@ -23,7 +23,7 @@ class PublishedTable:
     columns: Mapping[str, Numbers]
     """Numbers of each method. The last method is NormLift."""
     factor: float = 1.0
-    """Factor from the numbers of an evaluation to those of the table, such as 100 for percent."""
+    """Factor that converts numbers of an evaluation to the unit of the table, such as 100 for percent."""
 
 
 def _numbers(metrics: Sequence[str], rows: Mapping[str, Sequence[float]]) -> Numbers:
@@ -148,9 +148,9 @@ def compare_with_paper(
     """Return the paper's tables that the evaluation can be compared with, and its results in the column `yours`.
 
     Args:
-        evaluation: result of --protocol scannet or lerf. Studies belong to the data set of the paper: ablation and
+        evaluation: Result of --protocol scannet or lerf. Studies belong to the data set of the paper: ablation and
             signals to scannet, timing to lerf.
-        studies: rows of each study, by its name.
+        studies: Rows of each study, by its name.
     Returns:
         Rows by title of the table. `yours` is NaN if the evaluation lacks the scene or the variant, and `difference` is
         `yours` minus the number of NormLift.

@@ -59,8 +59,8 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
     """Read the property `label` of the vertices in a PLY file such as scene0000_00_vh_clean_2.labels.ply.
 
     Raises:
-        FileNotFoundError: if the file does not exist.
-        ValueError: if the file is not a PLY file, is damaged, or has no labels.
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file is not a PLY file, is damaged, or has no labels.
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(
@@ -115,7 +115,7 @@ def scene_scores(
     the set are prompts, but IoU and recall are computed only for the classes in the scene.
 
     Args:
-        classes: number of classes of the set, 10, 15 or 19.
+        classes: Number of classes of the set, 10, 15 or 19.
     """
     truth, prediction = predict_classes(scene, classes, min_opacity=min_opacity, without_direction=without_direction)
     return class_scores(confusion(truth, prediction, classes))
@@ -182,7 +182,7 @@ def label_scene(
     """Return the inputs of protocol scannet for a run.
 
     Raises:
-        ValueError: if the number of vertices differs from that of Gaussians.
+        ValueError: If the number of vertices differs from that of Gaussians.
     """
     check_identity(name, len(lifted.scene.gaussians), nyu40, path)
     prompts = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING
@@ -194,7 +194,7 @@ def run_scannet(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: S
     """Run protocol scannet with one run per scene.
 
     Raises:
-        FileNotFoundError, ValueError: if labels are missing or damaged, or have the wrong number of vertices.
+        FileNotFoundError, ValueError: If labels are missing or damaged, or have the wrong number of vertices.
     """
     truths = [read_labels(path) for path in labels]
     inputs = zip(runs, scene_names(labels), labels, truths)

@@ -49,9 +49,9 @@ def refine_variant(
     Args:
         variant: "none" returns the directions of the lift. "linear" averages the directions of N+ with the weights
             R_k d_ik and normalizes the result. The others vote with `variant_config` and `variant_reliability`.
-        beta: prior strength of the shrinkage of R, as in `lift`.
+        beta: Prior strength of the shrinkage of R, as in `lift`.
     Raises:
-        ValueError: if the variant is unknown.
+        ValueError: If the variant is unknown.
 
     >>> import torch
     >>> from normlift_ns import Evidence, RefineConfig, lift, refine_variant
@@ -86,7 +86,7 @@ def variant_source(
     """Run `refine` with the options and reliability of a variant.
 
     Raises:
-        ValueError: if the variant is unknown, or an argument of `refine` is invalid.
+        ValueError: If the variant is unknown, or an argument of `refine` is invalid.
     """
     reliability, config = variant_reliability(variant, scalars, beta), variant_config(variant, config)
     return refine(means, directions, reliability, config, own=scalars.own_evidence, neighbors=neighbors)
@@ -112,7 +112,7 @@ def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -
     ("support_only"). All other variants use the product of the last two, which is NormLift's R.
 
     Raises:
-        ValueError: if the variant is unknown.
+        ValueError: If the variant is unknown.
     """
     if variant not in get_args(Variant):
         raise InputError(f"variant must be one of {', '.join(get_args(Variant))}, got {variant!r}")
@@ -203,7 +203,7 @@ def variant_votes(variants: Mapping[str, Variant], owns: Sequence[Vote]) -> Iter
 def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
     """Yield the votes of `SWEEPS` around the values of each run, one vote per run.
 
-    Labels mark the default and the values of the runs, which are included.
+    The default and the values of the runs are included, and labels mark them.
     """
     for parameter, values in SWEEPS.items():
         default = default_value(parameter, owns[0].config.vote)
@@ -334,7 +334,7 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
 
 
 def _correct_predictions(scenes: Sequence[SceneSignals]) -> tuple[Bool[Tensor, " n"], dict[str, Bool[Tensor, " n"]]]:
-    """Return a mask of the Gaussians with ground truth, and a mask of correct predictions for each kind."""
+    """Return a mask of the Gaussians with ground truth, and a mask of correct ones for each kind of prediction."""
     truths = [scene.truth for scene in scenes if scene.truth is not None]
     if len(truths) < len(scenes):
         return torch.zeros(0, dtype=torch.bool), {}
@@ -367,7 +367,7 @@ def save_figure(figure: Figure, path: Path, *, overwrite: bool = False) -> None:
     """Write a figure reproducibly, without a date or random ids.
 
     Args:
-        overwrite: replace an existing file.
+        overwrite: Replace an existing file.
     """
     import matplotlib as mpl  # noqa: PLC0415 (only drawing needs it)
 
@@ -379,9 +379,9 @@ def sweeps_figure(rows: Sequence[Mapping[str, Any]], metric: str, label: str, re
     """Plot the metric against each parameter of `SWEEPS`, with one panel per parameter.
 
     Args:
-        rows: rows with parameter, value and metric. The flags `default` and `own` mark the default and the run's value.
-        label: axis label of the metric.
-        result: main result of the run, drawn as a horizontal line in all panels.
+        rows: Rows with parameter, value and metric. The flags `default` and `own` mark the default and the run's value.
+        label: Axis label of the metric.
+        result: Main result of the run, drawn as a horizontal line in all panels.
     """
     parameters = list(dict.fromkeys(row["parameter"] for row in rows))
     figure, axes = make_figure((2 * (len(parameters) + 1), 5), 2, -(-len(parameters) // 2), sharey=True)
@@ -473,10 +473,10 @@ def study_votes(
 def study_ablation(
     runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: str, warn: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
-    """Evaluate the protocol with every variant, both with and without consensus.
+    """Evaluate the protocol with every variant without consensus, and with `CONSENSUS_VARIANTS` after a consensus.
 
     Args:
-        warn: callback with the reason if variants are skipped, because the features of a run are not available.
+        warn: Callback with the reason if variants are skipped, because the features of a run are not available.
     """
     rows: list[Row] = []
     for on, names in ((False, {name: name for name in get_args(Variant)}), (True, CONSENSUS_VARIANTS)):
@@ -535,7 +535,7 @@ def study_baselines(runs: Sequence[EvaluatedRun], evaluate: Evaluate, device: st
     """Evaluate the protocol for the runs and for `BASELINES` on the same features. Baselines are not refined.
 
     Raises:
-        ValueError, FileNotFoundError: if the features of a run are not available (see `lifted_batches`).
+        ValueError, FileNotFoundError: If the features of a run are not available (see `lifted_batches`).
     """
     rows: list[Row] = []
     for name, what, refined in (("normlift", "the run, refined", True), ("unrefined", "the run, unrefined", False)):
@@ -555,7 +555,7 @@ def study_timing(
     On a GPU, also time SFS's method and that of this package on some views of each run.
 
     Args:
-        tell: callback with the reason if SFS's method is skipped.
+        tell: Callback with the reason if SFS's method is skipped.
     """
     rows = []
     for lifted in runs:

@@ -221,7 +221,11 @@ def _folders(run_dir: Path, names: Sequence[str | None], output_dir: Path) -> tu
 
 
 def _dataset_candidates(stored: Path, output_dir: Path, root: Path | None) -> list[Path]:
-    """Return the possible paths of a dataset, relative to the working directory of the training or the current one."""
+    """Return the possible absolute paths of a dataset, given its path relative to the working directory of the
+    training.
+
+    If `root` is None, this directory is unknown, and may be any parent of `output_dir`. The current directory is last.
+    """
     roots = output_dir.parents if root is None else (root,)
     return list(dict.fromkeys(_absolute(base / stored) for base in (*roots, Path.cwd())))
 

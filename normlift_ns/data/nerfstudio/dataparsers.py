@@ -146,7 +146,7 @@ def _skew(axis: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
 
 
 def _focus_point(poses: Float[Tensor, "v 4 4"], focus: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
-    """Return the point that is closest to the optical axes of the cameras, without cameras that face away from it."""
+    """Return the point closest to the optical axes of the cameras. Cameras that face away from it do not count."""
     directions, origins = -poses[:, :3, 2:3], poses[:, :3, 3:4]
     active = torch.sum(directions.squeeze(-1) * (focus - origins.squeeze(-1)), dim=-1) > 0
     converged = False
