@@ -28,8 +28,8 @@ def slic(image: UInt8[np.ndarray, "h w 3"], count: int, compactness: float) -> I
     """Return the superpixel of every pixel, as `skimage.segmentation.slic` does with `start_label=0`.
 
     Args:
-        count: approximate number of superpixels.
-        compactness: weight of distance relative to color.
+        count: Approximate number of superpixels.
+        compactness: Weight of distance relative to color.
     """
     from skimage.color import rgb2lab  # noqa: PLC0415 (takes 0.5 s; other regions do not need it)
     from skimage.util import img_as_float, regular_grid  # noqa: PLC0415 (as above)
