@@ -135,7 +135,7 @@ def test_the_readme_is_short_and_its_figures_are_those_of_the_results():
         wanted = " | ".join(cells[header.index(method)] for method in ("paper", DEFAULT))
         assert row.endswith(f"| {wanted} |"), row
     gain, worst = real.interval(f"choice.{DEFAULT}.gain"), -real.values[f"choice.{DEFAULT}.worst"]
-    assert f"it is {gain}, {worst:.1f} in the worst cell" in shown
+    assert f"is {gain}, {worst:.1f} in the worst cell" in shown
     hard = next(line for line in made["reliability-tabletop"].splitlines() if line.startswith("| hard |"))
     assert "51 to 100 %" in hard and "51 % of the Gaussians in its lowest tenth are right, and 100 %" in shown
     for table, gain in (("grid-second", "5.1 ± 0.8"), ("grid-third", "5.1 ± 1.0")):

@@ -554,7 +554,7 @@ def add_help_texts(options: Any, *, nested: bool = False) -> Any:
 @cache
 def _class_definitions(module: str) -> dict[str, list[ast.stmt]]:
     """Return the statements of every class at the top level of a loaded module; none without its source."""
-    with suppress(OSError):
+    with suppress(OSError, TypeError):  # TypeError: the module has no file
         tree = ast.parse(inspect.getsource(sys.modules[module]))
         return {node.name: node.body for node in tree.body if isinstance(node, ast.ClassDef)}
     return {}

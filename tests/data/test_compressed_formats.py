@@ -282,7 +282,7 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
         ("a.glb", _with_glb(lambda d: d["nodes"].append({"mesh": 0})), "several instances"),
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}})), "instances"),
         ("a.glb", b"glTF" + bytes(8), "header does not match"),
-        ("a.splat", bytes(33), "33 bytes, expected a multiple of 32"),
+        ("a.splat", bytes(33), "33 bytes, expected a positive multiple of 32"),
         ("a.splat", np.full(16, -1, "<f4").tobytes(), "negative scales"),
         ("a.ksplat", bytes(4096), "KSPLAT file.*npx @playcanvas/splat-transform a.ksplat a.ply"),
         ("a.lcc", b"{}", "LCC file.*npx @playcanvas/splat-transform a.lcc a.ply"),
