@@ -215,7 +215,6 @@ def run_lift(request: LiftRequest) -> LiftedRun:
     check_target(prepared)
     announce(prepared)
     collection = plan_collection(scene, prepared.source, prepared.lift, cache, device=device, export=request.export)
-    collection.start_preparing_regions()
     kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
     check_alignment(prepared, stages, kernels.wait_for_rendering)  # while the other kernels are compiled
     result = lift_collection(collection, kernels, device=device, encoder=prepared.encoder, report=request.report)

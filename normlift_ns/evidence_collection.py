@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from hashlib import blake2b
 from pathlib import Path
-from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
@@ -141,22 +140,6 @@ class EvidenceCollection:
     def _cached_source(self) -> FeatureSource:
         source = cached(self.source, self.cache) if self.options.reuse_evidence else self.source
         return downscaled_source(source, self.options.lift_downscale)
-
-    def start_preparing_regions(self) -> None:
-        """Load the segmentation method in a background thread.
-
-        Errors are suppressed, because the first image raises them again.
-        """
-        prepare = getattr(getattr(self._cached_source, "regions", None), "prepare", None)
-
-        if prepare is None:
-            return
-
-        def work() -> None:
-            with suppress(Exception):
-                prepare()
-
-        Thread(target=work, name="prepare regions", daemon=True).start()
 
     def collect(self, stages: StageTimer, kernels: Kernels) -> ViewObservations:
         """Collect evidence, features and levels from all views.

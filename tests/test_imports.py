@@ -49,7 +49,7 @@ FOREIGN = {
     **dict.fromkeys(("api", "pipeline"), TENSORS),
     "io": BASE | {"xxhash", "msgspec"},
     "kernels": TENSORS | {"triton"},
-    "core": BASE | {"numba"},
+    "core": BASE,
     "rasterization": TENSORS | {"numpy", "numba", "gsplat", "typing_extensions"},
     "encoders": BASE | {"xxhash", "open_clip", "PIL", "huggingface_hub", "torchvision", "skimage"},
     "segmentation": BASE | {"skimage", "PIL", "huggingface_hub", "torchvision", "h5py"},

@@ -7,13 +7,14 @@ function calls. After such a change, delete the .nbi files in the `__pycache__` 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numba
 import numpy as np
 from numba import types
 from numba.extending import overload
 
-from normlift_ns.core.compilation import cached_njit
 from normlift_ns.core.evidence import UNLABELED
 
 _F = np.float32
@@ -23,6 +24,18 @@ _LOG2_E32, _LN2_HIGH32, _LN2_LOW32, _LEAST32 = _F(1.44269504088896341), _F(0.693
 _LOG2_E64, _LN2_HIGH64, _LN2_LOW64 = 1.44269504088896341, 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _P0, _P1, _P2 = _F(1.9875691500e-4), _F(1.3981999507e-3), _F(8.3334519073e-3)
 _P3, _P4, _P5, _ONE = _F(4.1665795894e-2), _F(1.6666665459e-1), _F(5.0000001201e-1), _F(1)
+
+
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator like `numba.njit`, with a cache on disk if a cache folder is writable."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=True, error_model="numpy", **options)(function)
+        except RuntimeError:  # numba cannot write to this folder or the user's cache folder
+            return numba.njit(error_model="numpy", **options)(function)
+
+    return decorate
 
 
 kernel = cached_njit()

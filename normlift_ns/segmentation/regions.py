@@ -21,7 +21,6 @@ from torch import Tensor
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_npy
 from normlift_ns.io.guard import open_regular
-from normlift_ns.io.memory import free_memory
 
 _IMAGE_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM")
 """Formats of training images. Pillow passes some other formats to external programs, such as PostScript to
@@ -83,11 +82,8 @@ _MAX_MAP_BYTES = 2**31
 """Largest size of a label map file, in bytes."""
 _COMPACTNESS = 10.0
 """Weight of spatial distance relative to color distance in superpixels. Larger values produce squarer regions."""
-_IMAGE_BYTES = 2**31
-"""Memory that superpixels of an image of 12 megapixels take."""
-_FREE = min(free_memory().values(), default=8 * _IMAGE_BYTES)
-_WORKERS = max(1, min(16, os.cpu_count() or 1, _FREE // _IMAGE_BYTES))
-"""Number of images to segment concurrently."""
+_WORKERS = min(8, os.cpu_count() or 1)
+"""Number of images to segment concurrently. Superpixels need many times the memory of their image."""
 
 
 class RegionDefaults:
@@ -101,9 +97,6 @@ class RegionDefaults:
 
     def files(self, name: str) -> tuple[Path, ...]:
         return ()
-
-    def prepare(self) -> None:
-        """Load what segments images, in a background thread before the first image."""
 
 
 @dataclass(frozen=True)
@@ -120,15 +113,10 @@ class Superpixels(RegionDefaults):
         return {"kind": "superpixel", "count": self.count, "compactness": _COMPACTNESS}
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
-        from normlift_ns.segmentation.slic import slic  # noqa: PLC0415 (takes a second; other regions do not need it)
+        from skimage.segmentation import slic  # noqa: PLC0415 (takes 0.5 s; other regions do not need it)
 
-        segments = slic(image.numpy(), self.count, _COMPACTNESS)
+        segments = slic(image.numpy(), n_segments=self.count, compactness=_COMPACTNESS, start_label=0)
         return _compact(segments, np.ones(segments.shape, dtype=bool))[None, None]
-
-    def prepare(self) -> None:
-        from normlift_ns.segmentation.slic import compile_kernels  # noqa: PLC0415 (as above)
-
-        compile_kernels()
 
 
 @dataclass(frozen=True)

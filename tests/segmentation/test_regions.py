@@ -5,15 +5,12 @@ import struct
 import zlib
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from skimage import segmentation
 
 from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels, read_image
-from normlift_ns.segmentation.slic import slic
 from tests.encoders.tiny import noise, refused
 
 
@@ -34,16 +31,6 @@ def test_grid_cells_are_squares_of_one_size(height, width, count):
 
 def test_grid_by_hand():
     assert Grid(2).labels(torch.zeros(2, 3, 3, dtype=torch.uint8), "").tolist() == [[[[0, 0, 1]] * 2]]
-
-
-@pytest.mark.parametrize(
-    ("height", "width", "count"), [(1, 1, 3), (37, 53, 7), (37, 53, 256), (5, 90, 5000), (90, 120, 50)]
-)
-def test_superpixels_are_those_of_scikit_image(height, width, count):
-    for levels in (1, 3, 256):  # of each channel
-        image = (noise(height, width).int() * levels // 256 * (255 // max(1, levels - 1))).to(torch.uint8)
-        expected = segmentation.slic(image.numpy(), n_segments=count, compactness=10.0, start_label=0)
-        assert (slic(image.numpy(), count, 10.0) == expected).all()
 
 
 def test_superpixels_keep_to_edges_also_of_tiny_images():
