@@ -110,8 +110,8 @@ class Why:
     views: tuple[ViewVote, ...]
     """Votes of the images with weight > 0, by descending weight."""
     copied: int = 0
-    """Number of selected Gaussians that use the direction of another one. This value of version 0.2 will be removed; use
-    `changed`."""
+    """Number of selected Gaussians that use the direction of another one. This value of version 0.2 will be removed.
+    Use `changed` instead."""
 
     @property
     def most_different(self) -> tuple[ViewVote, ...]:
