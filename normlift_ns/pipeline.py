@@ -35,12 +35,12 @@ from normlift_ns.core.evidence import Entries, Evidence
 from normlift_ns.core.field import CHANGED_COSINE, SemanticField
 from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.gaussians import GaussianScene
-from normlift_ns.core.independence import independent_views, pair_reliability
 from normlift_ns.core.left_out import leave_views_out
-from normlift_ns.core.lift import Lifted, lift, norm_of_reliability
+from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.null_level import with_null_level
 from normlift_ns.core.refine import clamp_k, labeled_share, refine, unsupported
+from normlift_ns.core.reliability import independent_views, norm_of_reliability, pair_reliability
 from normlift_ns.core.scene import Scene, camera_summary
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
@@ -273,7 +273,7 @@ def with_stored_reliability(lifted: Lifted, means: Float[Tensor, "n 3"], collect
     kind, beta, scalars = collection.options.reliability, collection.options.reliability_beta, lifted.scalars
     if kind == "paper":
         return lifted
-    views, norm = scalars.n_eff.double(), norm_of_reliability(scalars, beta)
+    views, norm = scalars.n_eff.double(), norm_of_reliability(scalars.reliability, scalars.n_eff, beta)
     if kind == "angular":
         cameras = (collection.scene.train.cameras[index] for index in collection.views)
         centers = torch.stack([camera.world_to_camera.double().cpu().inverse()[:3, 3] for camera in cameras])
