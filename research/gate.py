@@ -3,8 +3,8 @@
     python -m research.gate --workers 12                all scenes; for a GPU
     python -m research.gate --quick                     a small room and three cells, for the tests
 
-Every form votes after the consensus with the posterior vote. Its gate is fixed (tau, gamma) or relative (`core.gate`).
-It may abstain, so that a Gaussian keeps its direction:
+Every form votes after the consensus with the posterior vote. Its gate is fixed (tau, gamma) or relative (see
+`core.refine.relative_gate`). It may abstain, so that a Gaussian keeps its direction:
 
 * delta: the winner must lead by this much, in units of R times views (equation 10);
 * quorum: neighbors of this share of the weight must agree with the winner; P g(1) is full agreement;
@@ -61,9 +61,9 @@ from normlift_ns.core.consensus import (
     sample_gaussians,
     total_view_weights,
 )
-from normlift_ns.core.gate import relative_gate, shared_region_cosines
 from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.metrics import classify
+from normlift_ns.core.refine import relative_gate, shared_region_cosines
 from normlift_ns.core.reliability import independent_views, pair_reliability, reliability
 from research.batched_votes import CHUNK, Voters, mious, parts
 from research.candidates import Candidate

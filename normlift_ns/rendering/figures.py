@@ -28,7 +28,8 @@ from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_file, atomic_files, numbered_paths, safe_file_name
 from normlift_ns.options import WEAK_RELIABILITY
-from normlift_ns.query.engine import Answer, Finding, Verdict
+from normlift_ns.query.engine import Answer, Finding
+from normlift_ns.query.threshold import Verdict
 from normlift_ns.rasterization.rasterize import render, render_image, render_with_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering import colors

@@ -16,7 +16,6 @@ from normlift_ns.analysis.explain import ViewVote
 from normlift_ns.errors import InputError
 from normlift_ns.query.engine import Finding
 from normlift_ns.server import protocol
-from normlift_ns.server.coloring import legend, prompt_display_colors
 from normlift_ns.server.runs import ServedRun, to_jpeg, without_paths
 from normlift_ns.session import actions
 from normlift_ns.session.actions import diagnose_prompts, threshold_suggestion
@@ -72,7 +71,8 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
         "reliability": 0.0 if query is None else query.min_reliability,
         "used_rule": None if query is None else query.rule,
         "used_negatives": [] if query is None else list(query.negatives),
-        "shown": state.shown, "color_mode": state.color_mode, "colormap": state.colormap, "legend": legend(state),
+        "shown": state.shown, "color_mode": state.color_mode, "colormap": state.colormap,
+        "legend": protocol.legend(state),
         "selected": int(selection.sum()),
         "selected_visible": int((selection & state.drawn).cpu().numpy()[rows].sum()),
         "hidden": int((~state.drawn).sum()), "total": len(state.space),
@@ -83,7 +83,7 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
     if not details:
         return content, ()
     if answer is not None and state.prompts_select:
-        colors = dict(zip(answer.texts, prompt_display_colors(state)))
+        colors = dict(zip(answer.texts, protocol.prompt_display_colors(state)))
         content["histogram"] = [
             {
                 "text": one.text, "color": colors[one.text], "warning": one.warning, "nearest": one.nearest_position,
@@ -99,7 +99,7 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
 def _prompts_json(state: State) -> list[dict[str, Any]]:
     """Return one row per prompt, with its result or its error."""
     answer = state.answer
-    colors = prompt_display_colors(state)
+    colors = protocol.prompt_display_colors(state)
     rows = []
     for prompt in state.prompts:
         row: dict[str, Any] = dict.fromkeys(("color", "verdict", "relevancy", "threshold", "count"))

@@ -33,8 +33,8 @@ from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, join_prompts, load_query
 from normlift_ns.query.text_encoder import encoder_name, own_words
 from normlift_ns.rasterization.rasterize import ray_weights, render
-from normlift_ns.server.coloring import NOT_DRAWN, Codes, pca_of
 from normlift_ns.server.permalink import PageView
+from normlift_ns.server.protocol import NOT_DRAWN, Codes, pca_of
 from normlift_ns.session.objects import LookAtTarget, ObjectRow, unoccluded_viewpoint
 from normlift_ns.session.outputs import selection_bytes, store_query
 from normlift_ns.session.prompts import build_query, encode_prompts, prompts_of_query
