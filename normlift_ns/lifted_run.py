@@ -166,7 +166,7 @@ class LiftedRun:
             min_reliability: Minimum reliability R of selected Gaussians, in 0..1.
             refined: Use the directions after the vote.
         Raises:
-            ValueError: There is no prompt, a prompt is empty, the encoder cannot encode a prompt, or a vector has
+            ValueError: No prompt is given, a prompt is empty, the encoder cannot encode a prompt, or a vector has
                 another number of values than the features.
 
         >>> from normlift_ns import open_run

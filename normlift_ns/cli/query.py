@@ -698,7 +698,7 @@ def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequ
     if result.row_count > 0:
         common.CONSOLE.print(result)
     for text, why in zip(texts, reasons):
-        common.info(f"{text}: {'nothing is selected, so there is no explanation.' if why is None else why.sentence}")
+        common.info(f"{text}: {'nothing is selected, so nothing can be explained.' if why is None else why.sentence}")
 
 
 def explanation_table(

@@ -249,7 +249,7 @@ def _vote(inputs: _VoteInputs, voters: Tensor, directions: Tensor, row_of: Tenso
 
 
 def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64[Tensor, ""]:
-    """Return sigma_d times the median spacing, in the units of the means, or sigma_d if there is no finite spacing."""
+    """Return sigma_d times the median spacing, in the units of the means, or sigma_d without a finite spacing."""
     finite = spacing[spacing.isfinite()]
     sigma = config.numbers.sigma_d
     if finite.numel() == 0:

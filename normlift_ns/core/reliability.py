@@ -15,7 +15,7 @@ w::
     R_j  = (max(0, N_j ||f_j|| ** 2 - 1) + beta r) / (N_j - 1 + beta),   r = 0.02
 
 For N views of equal weight with unit features, (N ||f|| ** 2 - 1) / (N - 1) is the mean cosine of these features over
-pairs of views. For a Gaussian in a single view, there are no pairs, so R = r.
+pairs of views. A Gaussian in a single view has no pairs, so R = r.
 """
 
 from __future__ import annotations

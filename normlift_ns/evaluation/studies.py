@@ -285,7 +285,7 @@ class SceneSignals:
     opacity: Float[Tensor, " n"]
     """Opacity in 0..1."""
     truth: Int[Tensor, " n"] | None = None
-    """Class of every Gaussian, or `NO_CLASS` for Gaussians to ignore. None if there is no ground truth."""
+    """Class of every Gaussian, or `NO_CLASS` for Gaussians to ignore. None without ground truth."""
     predictions: Mapping[str, Int[Tensor, " n"]] = field(default_factory=dict)
     """Predicted class of every Gaussian, under the keys "unrefined" and, if there was a vote, "refined"."""
 

@@ -211,7 +211,7 @@ def compares_cosines(manifest: Mapping[str, Any], encoder: str | None) -> bool:
 def judge(
     manifest: Mapping[str, Any], encoder: str | None, rule: RelevancyRule, *, top_cosine: float, top: float
 ) -> Verdict | None:
-    """Return the verdict on a prompt; None if there are no null words, limits or negatives to compare with.
+    """Return the verdict on a prompt; None without null words, limits or negatives to compare with.
 
     Args:
         manifest: Manifest of the field.

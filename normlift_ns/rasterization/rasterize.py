@@ -609,7 +609,8 @@ def ray_weights(
     """Return the weight alpha_j prod_{k<j} (1 - alpha_k) of every Gaussian along a ray, or 0 if the ray misses it.
 
     alpha_j is the opacity times the largest value of the Gaussian along the ray. Gaussians are sorted by the distance
-    of this maximum from the origin. There is no blur, so the result does not depend on the resolution of an image.
+    of this maximum from the origin. The Gaussians are not blurred, so the result does not depend on the
+    resolution of an image.
 
     Args:
         scene: N Gaussians.

@@ -45,7 +45,7 @@ class Display:
     """Scalars to render in addition to the colors, and their color scales.
 
     The class is immutable because the viewer renders in other threads. Q is the number of prompts; it is
-    0 if there is no answer.
+    0 without an answer.
     """
 
     values: Float[Tensor, "n q_plus_5"]
@@ -557,7 +557,7 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
         matches = matches or [i for i, image in enumerate(images) if PurePosixPath(image).stem == name]
         if len(matches) == 0:
             raise InputError(
-                f"--render-views: there is no training image {name!r}. Expected one of {len(images)} names from "
+                f"--render-views: the scene has no training image {name!r}. Expected one of {len(images)} names from "
                 f"{unique[0]!r} to {unique[-1]!r}, without suffix. Images held out for evaluation are not available."
             )
         if len(matches) > 1:

@@ -52,7 +52,7 @@ def region_mask(served: ServedRun, state: State, value: protocol.Region | protoc
     drawn = state.drawn & served.visible
     mask &= visible_gaussians(scene.gaussians, camera, drawn, rasterize_mode=scene.rasterize_mode)
     if not bool(mask.any()):
-        raise InputError("There are no visible Gaussians in this region. Draw a larger region.")
+        raise InputError("This region has no visible Gaussians. Draw a larger region.")
     return mask
 
 

@@ -72,7 +72,7 @@ class Latest(Generic[T]):
 
     @property
     def empty(self) -> bool:
-        """True if there is no value."""
+        """True if the slot has no value."""
         return len(self._values) == 0
 
 
