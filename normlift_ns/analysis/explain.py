@@ -30,8 +30,9 @@ from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.consensus import CHANCE_AGREEMENT, consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import CHANGED_COSINE, SemanticField
-from normlift_ns.core.lift import lift, norm_of_reliability
+from normlift_ns.core.lift import lift
 from normlift_ns.core.lowrank import StoredEvidence
+from normlift_ns.core.reliability import norm_of_reliability
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.base import FeatureSource
@@ -400,7 +401,8 @@ class RecordedVotes:
             return 1.0
         norms = [scalars.norm.double()]
         if self._option("reliability", str, "paper") == "paper":
-            norms.append(norm_of_reliability(scalars, self._option("reliability_beta", float, 1.0)))
+            beta = self._option("reliability_beta", float, 1.0)
+            norms.append(norm_of_reliability(scalars.reliability, scalars.n_eff, beta))
         return 1 - sum(float(norm[norm > 0].median()) for norm in norms) / len(norms)
 
     def _cached_evidence(self, block: evidence_collection.ViewBatch) -> Evidence:

@@ -276,7 +276,7 @@ class WarmServer:
             HTTPException: No run has this id (status 404).
         """
         if name not in self.runs.ids:
-            raise HTTPException(404, f"There is no run {name[:80]!r}. Choose one of: {', '.join(self.runs.ids)}.")
+            raise HTTPException(404, f"The server has no run {name[:80]!r}. Choose one of: {', '.join(self.runs.ids)}.")
         return await anyio.to_thread.run_sync(self.runs.get, name, limiter=self._opening, abandon_on_cancel=True)
 
     async def in_thread(self, work: Callable[[], T], *, slow: bool = True) -> T:

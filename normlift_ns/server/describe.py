@@ -16,7 +16,6 @@ from normlift_ns.analysis.explain import ViewVote
 from normlift_ns.errors import InputError
 from normlift_ns.query.engine import Finding
 from normlift_ns.server import protocol
-from normlift_ns.server.coloring import legend, prompt_display_colors
 from normlift_ns.server.runs import ServedRun, to_jpeg, without_paths
 from normlift_ns.session import actions
 from normlift_ns.session.actions import diagnose_prompts, threshold_suggestion
@@ -55,7 +54,7 @@ def region_mask(served: ServedRun, state: State, value: protocol.Region | protoc
     drawn = state.drawn & served.visible
     mask &= visible_gaussians(scene.gaussians, camera, drawn, rasterize_mode=scene.rasterize_mode)
     if not bool(mask.any()):
-        raise InputError("There are no visible Gaussians in this region. Draw a larger region.")
+        raise InputError("This region has no visible Gaussians. Draw a larger region.")
     return mask
 
 
@@ -74,7 +73,8 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
         "reliability": 0.0 if query is None else query.min_reliability,
         "used_rule": None if query is None else query.rule,
         "used_negatives": [] if query is None else list(query.negatives),
-        "shown": state.shown, "color_mode": state.color_mode, "colormap": state.colormap, "legend": legend(state),
+        "shown": state.shown, "color_mode": state.color_mode, "colormap": state.colormap,
+        "legend": protocol.legend(state),
         "selected": int(selection.sum()),
         "selected_visible": int((selection & state.drawn).cpu().numpy()[rows].sum()),
         "hidden": int((~state.drawn).sum()), "total": len(state.space),
@@ -85,7 +85,7 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
     if not details:
         return content, ()
     if answer is not None and state.prompts_select:
-        colors = dict(zip(answer.texts, prompt_display_colors(state)))
+        colors = dict(zip(answer.texts, protocol.prompt_display_colors(state)))
         content["histogram"] = [
             {
                 "text": one.text, "color": colors[one.text], "warning": one.warning, "nearest": one.nearest_position,
@@ -101,7 +101,7 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
 def _prompts_json(state: State) -> list[dict[str, Any]]:
     """Return one row per prompt, with its result or its error."""
     answer = state.answer
-    colors = prompt_display_colors(state)
+    colors = protocol.prompt_display_colors(state)
     rows = []
     for prompt in state.prompts:
         row: dict[str, Any] = dict.fromkeys(("color", "verdict", "relevancy", "threshold", "count"))

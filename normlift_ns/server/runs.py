@@ -33,8 +33,8 @@ from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, join_prompts, load_query
 from normlift_ns.query.text_encoder import encoder_name, own_words
 from normlift_ns.rasterization.rasterize import ray_weights, render
-from normlift_ns.server.coloring import NOT_DRAWN, Codes, pca_of
 from normlift_ns.server.permalink import PageView
+from normlift_ns.server.protocol import NOT_DRAWN, Codes, pca_of
 from normlift_ns.session.objects import LookAtTarget, ObjectRow, unoccluded_viewpoint
 from normlift_ns.session.outputs import selection_bytes, store_query
 from normlift_ns.session.prompts import build_query, encode_prompts, prompts_of_query
@@ -243,7 +243,7 @@ class ServedRun:
         """
         for name, gaussian in clicks.items():
             if gaussian >= len(self.space):
-                raise InputError(f"{name}: there is no Gaussian {gaussian:,}. The link is for another scene.")
+                raise InputError(f"{name}: this scene has no Gaussian {gaussian:,}. The link is for another scene.")
         rows = self.space.field.directions(torch.tensor(list(clicks.values()), dtype=torch.long)).cpu().numpy()
         return {**self.stored(), **{name: row for name, row in zip(clicks, rows) if np.any(row)}}
 
@@ -298,7 +298,7 @@ class ServedRun:
         """Return a training image as JPEG, with at most `max_size` pixels along its longer side."""
         if not 0 <= index < len(self.run.scene.train):
             raise InputError(
-                f"There is no image {index}. The run has {len(self.run.scene.train)} images, numbered from 0."
+                f"The run has no image {index}. It has {len(self.run.scene.train)} images, numbered from 0."
             )
         return to_jpeg(self.run.scene.train[index].image.cpu().numpy(), max_size)
 
@@ -415,7 +415,7 @@ class RunStore:
             ValueError: No run has this id, or the run cannot be opened.
         """
         if name not in self._configs:
-            raise InputError(f"There is no run {name!r}. Choose one of: {', '.join(self.ids)}.")
+            raise InputError(f"The server has no run {name!r}. Choose one of: {', '.join(self.ids)}.")
         with self._locks[name]:
             with self._lock:
                 if name in self._open:

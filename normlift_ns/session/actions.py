@@ -13,8 +13,9 @@ from torch import Tensor
 
 from normlift_ns.errors import InputError
 from normlift_ns.options import WEAK_RELIABILITY
-from normlift_ns.query.engine import Finding, Histogram
+from normlift_ns.query.engine import Finding
 from normlift_ns.query.question import Query, join_prompts
+from normlift_ns.query.threshold import Histogram
 from normlift_ns.rendering.colors import RGB, clip_text, prompt_rgb_tuples
 from normlift_ns.session.prompts import Prompt, is_click
 from normlift_ns.session.state import BY_HAND, Addition, Layer, State
@@ -166,11 +167,11 @@ def use_suggested_threshold(state: State) -> State:
     """Set the threshold that the relevancies of the selecting prompts suggest.
 
     Raises:
-        ValueError: There is no query.
+        ValueError: The state has no query.
     """
     value = threshold_suggestion(state)
     if value is None:
-        raise InputError("There is no query yet, so no threshold can be suggested. Type a prompt and press Ask.")
+        raise InputError("This session has no query to suggest a threshold for. Type a prompt and press Ask.")
     return set_threshold(state, value)
 
 
@@ -217,7 +218,7 @@ def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
     weights = weights.where(state.space.field.valid(refined=state.refined) & state.drawn, 0.0)
     index = int(weights.argmax()) if len(weights) > 0 else 0
     if len(weights) == 0 or not float(weights[index]) > 0:
-        raise InputError("There is no Gaussian with semantics at this position. Click a visible object.")
+        raise InputError("This position has no Gaussian with semantics. Click a visible object.")
     return index
 
 
@@ -400,5 +401,5 @@ def find_layer(state: State, name: str) -> Layer:
     """
     layer = next((layer for layer in state.layers if layer.name == name), None)
     if layer is None:
-        raise InputError(f"There is no layer {clip_text(name, 60)!r}. Choose one of the listed layers.")
+        raise InputError(f"This session has no layer {clip_text(name, 60)!r}. Choose one of the listed layers.")
     return layer

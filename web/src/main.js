@@ -412,7 +412,7 @@ class Page {
     if (probe) {
       this.probes.delete(seq);
       probe(position);
-      if (!position) toast("There is no object at this position. Click an object.", {});
+      if (!position) toast("This position has no object. Click an object.", {});
       return;
     }
     if (seq !== this.pointed || !this.pointer) return;
@@ -479,7 +479,7 @@ class Page {
   async screenshot(anchor) {
     const name = `${this.run.name}.png`.replace(/[^\w.-]+/g, "_");
     const blob = this.scene ? await this.scene.screenshot() : await this.stills.blob();
-    if (!blob) return toast("There is no image yet. Try again in a moment.", { kind: "error", anchor });
+    if (!blob) return toast("The page has no image yet. Try again in a moment.", { kind: "error", anchor });
     saveBlob(blob, name);
     toast(`Downloaded ${name}`, { kind: "done", anchor });
   }
