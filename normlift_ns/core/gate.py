@@ -5,7 +5,7 @@ other of 0.73 to 0.95 in CLIP and near 0 in a classifier, so no fixed cosine sui
 of one object agree closely, and this agreement can be measured in the lift. Let `same` be the cosines of lifted
 directions of neighbors that share a region in at least half of the views that show both::
 
-    tau   = 5 % quantile of same
+    tau   = 5 % quantile of same, at most 0.9985
     gamma = (1 - tau) / 2
 """
 
@@ -39,7 +39,7 @@ def sample_pairs(
 
     Args:
         gaussians: Index of every row among all n Gaussians.
-        neighbors: Neighbors of every row, -1 for none.
+        neighbors: Neighbors of every row, -1 for none. Rows for which -1 is chosen are left out.
     """
     number, share = hash_to_unit(gaussians), min(1.0, _PAIRS / max(1, n))
     row = (number < share).nonzero().squeeze(1)
@@ -52,6 +52,8 @@ def shared_region_cosines(
     lifted: Lifted, first: Int64[Tensor, " p"], second: Int64[Tensor, " p"], level: Int64[Tensor, " s"] | None = None
 ) -> Float64[Tensor, " q"]:
     """Return <u_i, u_k> of the pairs that share a region in at least half of the views that show both.
+
+    Pairs with a Gaussian without a direction are left out.
 
     Args:
         first, second: Rows of the two Gaussians of every pair.

@@ -189,7 +189,7 @@ def refine_subset(
     ends = can_change.cumsum(0)[size - 1 : -1 : size].tolist()
     for block in voters[can_change].tensor_split(ends):
         if len(block) > 0:
-            retry_in_halves(vote, block, "run the vote on the CPU")
+            retry_in_halves(vote, block, "lift on the CPU (--device cpu), or give `refine` tensors on the CPU")
         done = min(done + size, len(voters))
         if progress is not None and len(voters) > 0:
             progress(done, len(voters))
