@@ -66,8 +66,8 @@ class LiftResult(NamedTuple):
 
     field: SemanticField
     seconds: dict[str, float]
-    """Duration of each stage, in order: features, evidence, consensus and recognition (if enabled), lift, neighbors,
-    vote, store."""
+    """Duration of each stage, in order: features, evidence, consensus, recognition, lift, neighbors, vote, store.
+    Stages that the options disable are left out; neighbors and vote belong together."""
 
 
 def lift_scene(

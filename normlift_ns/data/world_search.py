@@ -135,7 +135,7 @@ class _Search:
         return _Motion(candidate.matrix @ self._back, candidate.opencv_cameras != self._flipped)
 
     def agreement(self, candidates: Sequence[CandidateWorld]) -> Float[Tensor, " w"]:
-        """Return how well points of the splat agree with the images in each world, in -1..1."""
+        """Return the mean correlation of points of the splat with the images in each world, in -1..1."""
         return self._points.agreement([self._motion(candidate) for candidate in candidates])
 
     def likely(self, candidates: Sequence[CandidateWorld]) -> list[CandidateWorld]:
@@ -175,7 +175,7 @@ class _Search:
         return small._replace(view=small.view._replace(camera=camera)).render(self._scene, self._gaussians, settings)
 
     def _refine(self, candidate: CandidateWorld, log: float) -> float | None:
-        """Return the logarithm of the scale that fits best, near a first guess; None if its render is not similar.
+        """Return the logarithm of the scale that fits best, near a first guess; None if a render does not fit an image.
 
         Points refine the guess to a few percent. Parabolas through the mean squared errors of renders of one view then
         refine it further.
@@ -278,7 +278,7 @@ def find_world(
     device: str,
     say: Callable[[str], None],
 ) -> SplatScene:
-    """Return the scene in the world in which its renders reach the usual PSNR.
+    """Search for the world in which renders of the scene reach the usual PSNR, and return the scene in this world.
 
     If the first world fits, no other world is tried. Otherwise, the result is the scene in the only other world that
     fits, or in the first world if none or several fit.
@@ -287,7 +287,7 @@ def find_world(
         candidates: Possible worlds.
         scene_in: Function that returns the scene in a world.
         device: torch device to render on.
-        say: Function that is called with a sentence if another world fits.
+        say: Function that is called with a message if other worlds fit.
     """
     here = candidates[0]
     scene = scene_in(here)

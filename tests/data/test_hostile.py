@@ -211,7 +211,7 @@ def test_rotations_and_animations_are_remarked(tmp_path: Path) -> None:
     exif[0x0112] = 3
     two = {"save_all": True, "append_images": [Image.new("RGB", (40, 30), "red")]}
     for kind, more, expected in (
-        *((kind, {"exif": exif}, "1 of 1 .* EXIF") for kind in ("JPEG", "PNG", "WEBP", "TIFF")),
+        *((kind, {"exif": exif}, "EXIF .*1 of 1,") for kind in ("JPEG", "PNG", "WEBP", "TIFF")),
         *((kind, two, "several") for kind in ("GIF", "PNG", "WEBP", "TIFF")),
         *((kind, {}, None) for kind in ("JPEG", "PNG", "WEBP", "TIFF")),
     ):

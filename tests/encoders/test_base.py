@@ -85,7 +85,7 @@ def test_regions_without_a_feature_are_unlabeled(kind, tmp_path):
             assert region[::2, ::2].tolist() == [[0, -1], [1, -1]]
             assert torch.equal(view.features, torch.eye(4)[::2])
         assert encoder.calls == 2
-    refused(lambda: plugin.text(["a"]), "'blind'", "length is not 1")
+    refused(lambda: plugin.text(["a"]), "'blind'", "expected 1")
 
 
 def test_other_images_and_texts_are_refused():
