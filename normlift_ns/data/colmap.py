@@ -80,7 +80,7 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
         return models[0]
     counts = {model: _count_images(model) for model in models}
     largest = max(models, key=counts.__getitem__)
-    listed = ", ".join(f"{relative_name(model, folder)} with {count:,} images" for model, count in counts.items())
+    listed = ", ".join(f"{relative_name(model, folder)} (images: {count:,})" for model, count in counts.items())
     say(
         f"{folder} contains several reconstructions: {listed}. The largest one, {relative_name(largest, folder)}, is "
         "used. To use another one, give its folder with --colmap."

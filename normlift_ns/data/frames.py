@@ -297,8 +297,8 @@ def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Pat
     Args:
         folder: Folder to search.
         name: Absolute path, or path relative to the folder.
-        copies: True for a folder of copies, such as images_2. Leading folders of relative paths may then be missing,
-            and absolute paths themselves are not tried.
+        copies: True for a folder of copies, such as images_2, in which leading folders of relative paths may be
+            missing. The absolute path itself is not tried.
     """
     plain = plain_name(name)
     path = PureWindowsPath(plain) if PureWindowsPath(plain).is_absolute() else PurePosixPath(plain)

@@ -298,7 +298,7 @@ def _read_accessor(gltf: _Gltf, index: int, name: str, size: int) -> Float[np.nd
     end = accessor.byte_offset + (accessor.count - 1) * stride + dtype.itemsize * size
     if accessor.count < 1 or accessor.byte_offset < 0 or stride < dtype.itemsize * size or end > len(data):
         raise _damaged(
-            gltf.path, f"{name} declares {accessor.count:,} rows, which do not match its {len(data):,} bytes"
+            gltf.path, f"the number of rows of {name}, {accessor.count:,}, does not match its {len(data):,} bytes"
         )
     shape, strides = (accessor.count, size), (stride, dtype.itemsize)
     values = np.ndarray(shape, dtype, data, accessor.byte_offset, strides).astype(np.float32)

@@ -371,7 +371,7 @@ def _assumptions(
         lifted = "lifted too" if options.views == "all" else "not lifted"
         texts.append(f"Images held out of the training are {lifted} ({len(held_out)} of {len(frames)} images).")
     else:
-        texts.append(f"All {len(frames)} images are lifted; to hold out some, give --test-every or --eval-images.")
+        texts.append(f"All images are lifted ({len(frames)}); to hold out some, give --test-every or --eval-images.")
     texts += cameras.remarks
     if frames[0].intrinsics.fisheye:
         texts.append(_fisheye_assumption(frames[0]))

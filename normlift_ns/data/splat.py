@@ -47,7 +47,7 @@ _MIN_LOGITS = 100
 
 @dataclass(frozen=True)
 class SplatParameters:
-    """Raw parameters of N Gaussians, as trainers store them."""
+    """Raw parameters of Gaussians, as trainers store them."""
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
@@ -411,7 +411,7 @@ def _rest_names(path: Path, names: set[str]) -> list[str]:
     if count % 3 != 0 or count // 3 not in SH_DEGREES or not set(expected) <= names:
         counts = ", ".join(f"{3 * k} (degree {degree})" for k, degree in SH_DEGREES.items())
         raise InputError(
-            f"{path} has {count} properties f_rest_*, which does not match a degree of spherical harmonics. Expected "
+            f"{path} has properties f_rest_* ({count}) that do not match a degree of spherical harmonics. Expected "
             f"f_rest_0, f_rest_1, … with one of the counts {counts}. Export the scene again."
         )
     return expected

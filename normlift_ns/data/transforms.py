@@ -545,8 +545,8 @@ def _to_world(values: Any, path: Path, expected: str = _EXPECTED_DATAPARSER) -> 
     rows = stored.transform
     if not _is_matrix(rows) or not 0 < stored.scale < _MAX_VALUE:
         raise InputError(
-            f"{path} does not contain a transform: its transform has {len(rows)} rows, and its scale is "
-            f"{stored.scale:g}. Expected 3 rows of 4 finite numbers and a positive scale, as in {expected}."
+            f"{path} does not contain a valid transform (rows: {len(rows)}, scale: {stored.scale:g}). Expected 3 rows "
+            f"of 4 finite numbers and a positive scale, as in {expected}."
         )
     return WorldTransform(np.array(rows[:3]), stored.scale)
 

@@ -242,8 +242,7 @@ def _draw_points(scene: SplatScene, views: Sequence[ReducedView]) -> _Points:
 def _is_best_nearby(scene: SplatScene, device: str) -> bool:
     """Return True if the images fit worse after any rotation of the world by one degree about an axis.
 
-    A world that is only close to the correct one can reach the usual PSNR, but then one of the rotations improves the
-    fit.
+    A world that is only close to the correct one can reach the usual PSNR, but one of the rotations improves its fit.
     """
     gaussians, settings = scene.gaussians.to(device), RasterSettings.recorded(scene.identity)
     views = [view.reduced(_TURNED_SIDE) for view in sample_views(scene)]

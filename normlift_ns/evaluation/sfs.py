@@ -18,7 +18,7 @@ _EPSILON = 1e-12
 
 
 def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
-    """Return the threshold of SFS's attention maps as a float32 number. It selects scores >= threshold.
+    """Return Splat Feature Solver's threshold of a score map as a float32 number. It selects scores >= threshold.
 
     The histogram has 40 bins from the smallest to the largest score. A peak is a bin with at least 600 pixels and no
     larger neighbor, so every bin of a flat top is a peak. The rule uses the k-th peak from the right for k true

@@ -168,7 +168,7 @@ def test_nan_and_missing_files_are_named(tmp_path: Path) -> None:
         read_transforms(path)
     path.write_text(whole)
     (tmp_path / "images" / "b.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"1 of the 2 .* images/b.png"):
+    with pytest.raises(FileNotFoundError, match=r"1 of 2, .* images/b.png"):
         read_transforms(path)
     with pytest.raises(InputError, match="no cameras"):
         check_frames([], path)
