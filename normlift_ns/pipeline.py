@@ -67,7 +67,7 @@ class LiftResult(NamedTuple):
     field: SemanticField
     seconds: dict[str, float]
     """Duration of each stage, in order: features, evidence, consensus, recognition, lift, neighbors, vote, store.
-    Stages that the options disable are left out; neighbors and vote belong together."""
+    Stages that the options disable are left out."""
 
 
 def lift_scene(

@@ -462,7 +462,7 @@ def diagnose_weights(missing: Sequence[str]) -> Diagnostic:
     """Check that all weights are on this machine."""
     if len(missing) == 0:
         return Diagnostic("weights", "ok", "all required weights are on this machine")
-    message = f"not on this machine: {'; '.join(missing)}. A lift downloads only weights from the Hugging Face hub"
+    message = f"not on this machine: {'; '.join(missing)}. A lift downloads only those from the Hugging Face hub"
     return Diagnostic(
         "weights",
         "warning",

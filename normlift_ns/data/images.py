@@ -281,6 +281,8 @@ class SplitViews:
             raise FileNotFoundError(
                 f"{error.filename} is missing, but {self._LISTED_IN} lists it. Copy it to this path."
             ) from error
+        except MemoryError:
+            raise
         except Exception as error:  # Pillow's readers and nerfstudio's checks raise any kind of exception
             mask = self._masks[index]
             advice = (

@@ -44,7 +44,7 @@ def open_splat(
     device: str = "auto",
     say: Callable[[str], None] = lambda text: None,
 ) -> SplatScene:
-    """Open a trained splat and its images, with the cameras in the world of `SplatOptions.world_transform`.
+    """Open a trained splat and its images, with the cameras in the world that `SplatOptions.world_transform` selects.
 
     Args:
         path: A plain or compressed PLY file, an SPZ, .splat, GLB or glTF file, or ckpt_<step>_rank<r>.pt of gsplat's

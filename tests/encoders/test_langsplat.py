@@ -190,7 +190,7 @@ def test_missing_frames_are_listed_and_refused_or_left_out(folder):
     lenient = source(folder, missing="skip")
     with pytest.warns(UserWarning, match=r"2 of 3 .*images/frame_00002\.jpg, images/frame_00003\.jpg"):
         assert lenient.available(names) == [NAME]
-    refused(lambda: lenient.available(names[1:2]), "1 of 1", error=FileNotFoundError)
+    refused(lambda: lenient.available(names[1:2]), "1 of 1", "--features-dir", error=FileNotFoundError)
     refused(lambda: source(folder).view(IMAGE, names[1]), "frame_00002.jpg", error=FileNotFoundError)
 
 
