@@ -87,7 +87,7 @@ class CachedRegions(_Cached):
         return labels.int()
 
     def prepare(self) -> None:
-        """Prepare the segmentation if no label maps are cached."""
+        """Prepare the segmentation if the cache folder does not exist."""
         if not self.folder.exists():
             self.inner.prepare()
 
