@@ -97,7 +97,7 @@ class TorchCommunicator(Communicator):
         return result
 
     def claim_chunks(self, count: int) -> Iterator[int]:
-        """Yield the chunks of this process, and then the chunks of other processes that are not claimed yet."""
+        """Yield chunks that no other process has claimed, beginning with the share of this process."""
         key, self._num_divisions = f"{self._num_divisions}-", self._num_divisions + 1
         first = count * self.rank // self.world_size
         for index in [*range(first, count), *range(first)]:
@@ -295,7 +295,8 @@ class Halo(NamedTuple):
     """Gaussians of a partition, followed by their neighbors in other processes."""
 
     lifted: Lifted
-    """Lift with the directions of all Gaussians of the halo. The norm is its only valid scalar."""
+    """Lift with the directions of all Gaussians of the halo. Neighbors in other processes have a norm, but all their
+    other scalars are 0."""
     neighbors: Neighbors
     """Neighbors of the partition's Gaussians, as row indices in `lifted`."""
     gaussians: Int64[Tensor, " all"]

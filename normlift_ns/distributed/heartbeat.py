@@ -77,7 +77,7 @@ class Heartbeat:
         return self.rank == 0 or self.failure is not None
 
     def wait_for_failure(self) -> PeerFailure | None:
-        """Wait for the cause of a communication error; return the failure, or None if all processes are running."""
+        """Wait for the cause of a communication error; return the failure, or None if none is detected in time."""
         self._waiting = True
         self._loss_detected.wait(HEARTBEAT_TIMEOUT + 5 * HEARTBEAT_INTERVAL)
         return self.failure

@@ -158,7 +158,8 @@ def _use_single_gpu(local_rank: int, device: str) -> None:
         return
     if local_rank >= count:
         raise InputError(
-            f"process {local_rank} on this machine needs its own GPU; start at most one process per GPU ({count} found)"
+            f"process {local_rank} on this machine needs its own GPU, but PyTorch finds {count}; start at most one "
+            "process per GPU, or use --device cpu"
         )
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
     os.environ["CUDA_VISIBLE_DEVICES"] = visible[local_rank] if local_rank < len(visible) > 1 else str(local_rank)
@@ -170,7 +171,8 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
 
     Args:
         device: "cpu", "cuda" or "auto".
-        log: Callback for a message about a lost process, called only if no other process reports it.
+        log: Callback for messages about a long wait for other processes, and about a lost process that no other process
+            reports.
     Raises:
         InputError: If the processes cannot connect, or the machine has too few GPUs.
         SystemExit: If another process fails or is lost; the exit code is 1.

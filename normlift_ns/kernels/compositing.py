@@ -1,8 +1,8 @@
 """Triton kernels for compositing, which list splats by cell, sum weights by region, and render any number of channels.
 
-A cell is one of gsplat's tiles or a part of one. The list of a cell contains every splat whose rectangle touches the
-tile, as in gsplat, and whose alpha can reach its threshold in the cell. The second condition is computed in float64
-with a margin for all float32 rounding of alpha. The sums are therefore the same as with gsplat's lists.
+A cell is one of gsplat's tiles or a part of one. The list of a cell contains the splats whose rectangle touches the
+tile, as in gsplat. Culling removes the splats whose alpha cannot reach its threshold in the cell. This test uses
+float64, and a margin for all float32 rounding of alpha. The sums are therefore the same as with gsplat's lists.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def _pairs(
 def build_cell_lists(
     projected: ProjectedSplats, views: int, grid: CellGrid, min_alpha: float, *, cull: bool = True
 ) -> CellLists:
-    """Return the lists of splats of all cells and views.
+    """Return the list of splats of every cell in every view, nearest first.
 
     Args:
         projected: Splats of all views.
@@ -416,7 +416,8 @@ def sum_regions(
     Args:
         splats: Projected Gaussians; see `SPLAT` and `SPLAT_2D`.
         lists: Splats by cell.
-        labels: Region of every pixel. -1 means unlabeled and is summed like a region; pixels below -1 are ignored.
+        labels: Region of every pixel. -1 means unlabeled and is summed like a region; pixels with other negative labels
+            are ignored.
         grid: Cells of an image.
         columns: Number of columns in keys, larger than the largest label + 1.
         limits: Limits of alpha and transmittance.

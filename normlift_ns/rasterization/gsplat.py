@@ -30,8 +30,8 @@ _CHANNELS = 32
 _COMPILED = ("frustum_margin", "min_compensation", "max_alpha", "min_alpha", "min_transmittance")
 """Constants of gsplat's compiled code that must equal those of the scene."""
 _EXTENT = ("per_axis", "radius_sigmas", "min_discriminant")
-"""Further constants of the compiled code. They may differ from those of the scene if it uses the squares of gsplat 1.4,
-because later versions support these too."""
+"""Further constants of the compiled code. They may differ from those of the scene if the scene uses the squares of
+gsplat 1.4 and a later version is installed, because `_squares` computes these."""
 _LARGE = 100.0
 """Scale in world units below which no determinant overflows, for focal lengths below 400,000 pixels."""
 _OVERFLOWS = 1e10
@@ -121,7 +121,7 @@ def check(job: RasterJob) -> None:
     """Raise ValueError if a scene is not in float32 on a GPU, has 2D Gaussians, or needs another version of gsplat."""
     check_gpu("gsplat", job)
     if job.is_2d:
-        raise InputError('backend "gsplat" draws 3D Gaussians only; use backend="triton" for 2D Gaussians')
+        raise InputError('backend "gsplat" draws 3D Gaussians only; use backend="auto" for 2D Gaussians')
     compiled = installed_settings()
     squares = compiled.per_axis and not job.settings.per_axis
     names = _COMPILED if squares else (*_COMPILED, *_EXTENT)

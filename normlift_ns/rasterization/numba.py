@@ -167,7 +167,7 @@ def kernel_signatures(dtype: torch.dtype) -> list[tuple[Any, Any]]:
 
 _F = np.float32
 _MAGIC32, _MAGIC64 = _F(1.5 * 2**23), 1.5 * 2**52
-"""Constant that rounds a small number to an integer when added to it. The last bits of the sum are this integer."""
+"""Constants that round a small number to an integer when added to it. The last bits of the sum are this integer."""
 _LOG2_E32, _LN2_HIGH32, _LN2_LOW32, _LEAST32 = _F(1.44269504088896341), _F(0.693359375), _F(-2.12194440e-4), _F(-87)
 _LOG2_E64, _LN2_HIGH64, _LN2_LOW64 = 1.44269504088896341, 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _P0, _P1, _P2 = _F(1.9875691500e-4), _F(1.3981999507e-3), _F(8.3334519073e-3)
@@ -273,7 +273,7 @@ def ellipse_extent(axis, low, high):  # pragma: no cover (compiled)
 
 @kernel
 def _touched_tiles(center, radius, size, count):  # pragma: no cover (compiled)
-    """Return the range (first, stop) of tiles along one axis that the square of a Gaussian touches.
+    """Return the range (first, stop) of tiles along one axis that the rectangle of a Gaussian touches.
 
     The result is the same as in `assign_tiles`.
     """
@@ -320,8 +320,8 @@ def list_tiles(
 ):  # pragma: no cover (compiled)
     """Return lists of the Gaussians that can contribute to pixels of each tile.
 
-    The square of each Gaussian touches the tile as in `projection.assign_tiles`, and its alpha can reach min_alpha in
-    the tile.
+    The rectangle of each Gaussian in a list touches the tile as in `projection.assign_tiles`, and its alpha can reach
+    min_alpha in the tile.
 
     Returns:
         The offsets and indices of `projection.TileLists`, and nine values of `_shape` for every Gaussian.

@@ -286,7 +286,7 @@ def assign_tiles(projected: AnyProjected, width: int, height: int, tile_size: in
 
 
 def compositing_weights(alpha: Float[Tensor, "p k"], min_transmittance: float) -> Float[Tensor, "p k"]:
-    """Return A_ij = alpha_ij prod_{k<j} (1 - alpha_ik) (eq. 1 of the paper) in P pixels of K Gaussians, nearest first.
+    """Return A_ij = alpha_ij prod_{k<j} (1 - alpha_ik) (eq. 1 of the paper) of K Gaussians, nearest first, in P pixels.
 
     A pixel stops before the first Gaussian that would reduce its transmittance to `min_transmittance` or less.
 

@@ -175,13 +175,13 @@ class RasterOptions(TypedDict, total=False):
     rasterize_mode: RasterizeMode
     """splatfacto's `rasterize_mode` in the training of the scene (default: classic)."""
     weight_power: int
-    """Exponent of the summed A_ij (default: 1, as in the paper). SFS's code uses 2. With 0, the sum is the number of
-    pixels that a Gaussian contributes to."""
+    """Exponent of the summed A_ij (default: 1, as in the paper). The code of Splat Feature Solver uses 2. With 0, the
+    sum is the number of pixels that a Gaussian contributes to."""
     settings: RasterSettings | None
     """Constants of the rasterizer (default: those of gsplat 1.4.0). See `RasterSettings.of_gsplat`."""
     dtype: torch.dtype | None
-    """Precision of the computation and of the weights (default: that of the scene). Sums are always computed in
-    float64."""
+    """Precision of the computation and of the weights (default: that of the scene). The backends "torch" and "numba"
+    compute sums in float64."""
 
 
 @check_arguments
@@ -195,7 +195,7 @@ def rasterize_evidence(
     progress: ViewProgress | None = None,
     **options: Unpack[RasterOptions],
 ) -> Evidence:
-    """Compute the evidence E_js = sum of A_ij over the pixels i of region s, for all views.
+    """Compute the evidence E_js = sum of A_ij ** weight_power over the pixels i of region s, for all views.
 
     The weights A_ij are those of the rasterizer that trained the scene, including its thresholds and drawing order.
 
@@ -210,15 +210,16 @@ def rasterize_evidence(
         num_regions: Number of regions per view (default: largest id + 1). Required if the feature table has rows for
             regions without pixels.
         backend: "torch" is the reference for any device and precision. "numba" is compiled for the CPU. "triton" is
-            fast, for float32 on a GPU. "gsplat" is stock gsplat, for float32 on a GPU with weight_power 1 and constants
-            of the installed version or older. "auto" selects the fastest backend for the device and the precision.
+            fast, for float32 on a GPU. "gsplat" is stock gsplat, for 3D Gaussians in float32 on a GPU, weight_power 1
+            and constants that the installed version supports. "auto" selects the fastest backend for the device and the
+            precision.
         progress: Callback after every view, with the number of finished views and the number of all views, or None if
             the latter is unknown.
         options: Keyword arguments of `RasterOptions`.
 
     Raises:
-        ValueError: If an option is unknown, labels have a wrong type or size, an id is out of range, or the iterables
-            have different lengths. The message names the view.
+        ValueError: If an option is invalid, the backend does not support the scene, labels have a wrong type or size,
+            an id is out of range, or the iterables have different lengths. Messages about labels name the view.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, rasterize_evidence
@@ -237,8 +238,8 @@ def rasterize_evidence(
     num_excluded = len(scene) - int(scene.drawable.sum())
     if num_excluded > 0:
         warnings.warn(
-            f"{num_excluded} of {len(scene)} Gaussians are not drawn, because they have parameters that are not finite "
-            "or out of range",
+            f"{num_excluded} of {len(scene)} Gaussians {'is' if num_excluded == 1 else 'are'} not drawn, because of "
+            "parameters that are not finite or out of range",
             stacklevel=3,
         )
     total = len(cameras) if isinstance(cameras, list | tuple) else None
@@ -304,7 +305,8 @@ def render(
         The image without background (add background * (1 - alpha)), and alpha in 0..1.
 
     Raises:
-        ValueError: If the values do not have one row per Gaussian, or an option is unknown.
+        ValueError: If the values do not have one row per Gaussian, an option is invalid, or the backend does not
+            support the scene.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, render
@@ -349,6 +351,8 @@ def render_image(
     gaussians: GaussianScene | None = None,
 ) -> UInt8[Tensor, "h w 3"]:
     """Render the trained scene in sRGB on its background, with the scene's own renderer if it has one.
+
+    The scene's own renderer needs only the camera. The other arguments are for scenes without a renderer.
 
     Args:
         scene: Scene to render.
@@ -406,8 +410,8 @@ def _job(
         )
     job = RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
     if job.is_2d and (job.antialiased or job.settings.per_axis):
-        problem = "without antialiasing" if job.antialiased else "by the rules of gsplat 1.4"
-        raise InputError(f"2D Gaussians can be drawn only {problem}")
+        needed = 'rasterize_mode "classic"' if job.antialiased else "the rules of gsplat 1.4 (option gsplat_version)"
+        raise InputError(f"2D Gaussians can be drawn only with {needed}")
     return job
 
 
@@ -430,8 +434,8 @@ def _zip_views(
         for name, item in zip(("cameras", "labels", "num_regions"), items):
             if item is end:
                 raise InputError(
-                    f"{name} has only {index} items, but there are more views; "
-                    "give one camera, one label map and one number of regions per view"
+                    f"{name} ends after {index} of the views; give one camera and one label map per view, and "
+                    "either one number of regions per view or no num_regions"
                 )
         yield items[0], items[1], items[2] if num_regions is not None else None
 
@@ -510,7 +514,8 @@ def contributors(
         One list per pixel, in the order of the pixels, on the device of the scene.
 
     Raises:
-        ValueError: If pixels are not integers or are outside the image, or an option is unknown.
+        ValueError: If pixels are not integers or are outside the image, an option is invalid, or the backend does not
+            support the scene.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, contributors

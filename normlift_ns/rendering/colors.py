@@ -1,9 +1,9 @@
 """Colors and legends of query results, the same in every viewer and figure.
 
-Relevancy is drawn with a perceptually uniform colormap that is readable with color blindness. Opacity rises with
-relevancy, so that weak matches are less visible. A prompt that contains a color name is drawn in that color. Other
-prompts get colors that are distinguishable with any color vision (Okabe and Ito, 2008), or further hues if these colors
-are used up.
+The default colormap of relevancy is perceptually uniform and readable with color blindness. Opacity rises with
+relevancy, so that weak matches are less visible. A prompt that names a saturated color is drawn in this color, unless
+an earlier prompt has it. Other prompts get colors that are distinguishable with any color vision (Okabe and Ito, 2008),
+or further hues if these colors are used up.
 """
 
 from __future__ import annotations

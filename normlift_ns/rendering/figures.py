@@ -157,8 +157,8 @@ def render_outputs(
 ) -> dict[str, Tensor]:
     """Return the semantic outputs of one image by name, each [H, W, 1] or [H, W, 3], the overlay last.
 
-    The outputs overlay, segmentation and reliability are color images with legends, on a gray render of the scene. The
-    other outputs are scalars sum_j A_ij value_j, 0 for empty pixels.
+    The outputs overlay, segmentation and reliability are color images on a gray render of the scene. The other outputs
+    are scalars sum_j A_ij value_j, 0 for empty pixels, except for relevancies with `named_by_text`.
 
     Args:
         rgb: Rendered scene, RGB in 0..1.
@@ -446,8 +446,8 @@ def save_overlays(
 ) -> list[Path]:
     """Write one PNG figure per camera and prompt and, for several cameras, one contact sheet per prompt.
 
-    Each figure shows the training image next to a render with the relevancy and an outline of the selection. All
-    figures share one color scale.
+    The figure of a camera shows the training image, if it can be read, next to a render with the relevancy and an
+    outline of the selection. All figures share one color scale.
 
     Args:
         cameras: Training cameras by file name prefix, as `training_cameras` returns them.

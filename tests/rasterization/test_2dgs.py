@@ -76,12 +76,13 @@ def test_triton_equals_the_reference(kind):
 
 def test_what_2d_gaussians_do_not_have_is_refused():
     scene, camera = flat(random_scene(5, dtype=torch.float32)), orbit_camera(0.0)
-    for options in ({"rasterize_mode": "antialiased"}, {"settings": RasterSettings.of_gsplat("1.5")}):
-        with pytest.raises(ValueError, match=r"2D Gaussians .*(without antialiasing|gsplat 1\.4)"):
+    newer = {"settings": RasterSettings.of_gsplat("1.5")}
+    for options, needed in (({"rasterize_mode": "antialiased"}, '"classic"'), (newer, r"gsplat 1\.4")):
+        with pytest.raises(ValueError, match=f"2D Gaussians .*{needed}"):
             render(scene, camera, torch.ones(5, 1), **options)
 
 
 def test_gsplat_backend_draws_3d_gaussians_only(monkeypatch):
     monkeypatch.setattr(gsplat, "check_gpu", lambda *_: None)
-    with pytest.raises(ValueError, match=r'3D Gaussians only; use backend="triton"'):
+    with pytest.raises(ValueError, match=r'3D Gaussians only; use backend="auto"'):
         gsplat.check(RasterJob(flat(random_scene(5)), False, RasterSettings(), torch.float32))
