@@ -222,7 +222,7 @@ def run_lift(request: LiftRequest) -> LiftedRun:
 
 
 def prepare_lift(request: LiftRequest) -> PreparedLift:
-    """Load encoders, open the scene and choose the run directory, without writing any file."""
+    """Load encoders, open the scene and choose the run directory, without writing to this directory."""
     device, options = choose_device(request.device), (request.source or SourceOptions()).looking_for(request.queries)
     init_cuda(device)
     source = None

@@ -232,8 +232,9 @@ _MODES: dict[str, RasterizeMode] = {
 def read_ply(path: Path) -> SplatFile:
     """Read a splat from a PLY file, which may be compressed.
 
-    Properties may be in any order, and unknown properties are ignored. The property filter_3D is applied to scales and
-    opacities, as in Mip-Splatting. Peak memory is slightly more than one copy of the Gaussians.
+    Properties may be in any order. Unknown properties are ignored, except those of other primitives. The property
+    filter_3D is applied to scales and opacities, as in Mip-Splatting. Peak memory is slightly more than one copy of the
+    Gaussians.
 
     Raises:
         FileNotFoundError: The file does not exist.

@@ -159,7 +159,7 @@ class ImageNetEncoder:
         a query needs one vector.
 
         Raises:
-            InputError: If `prompts` or a prompt is empty, or a prompt does not name a class.
+            InputError: If `prompts` or a prompt is empty, a prompt does not name a class, or the weights are damaged.
             FileNotFoundError: If the weights are not on this machine.
         """
         check_prompts(prompts)
