@@ -348,7 +348,7 @@ def _not_ply(path: Path, error: Exception) -> InputError:
 
 
 def _check_properties(path: Path, vertex: PlyElement) -> bool:
-    """Return True if the vertices are 2D Gaussians, which have two scales; raise InputError for other properties."""
+    """Return True for 2D Gaussians, which have two scales; raise InputError if properties are missing or lists."""
     names = {item.name for item in vertex.properties}
     required = [name for columns in _COLUMNS.values() for name in columns]
     missing = [name for name in required if name not in names]
