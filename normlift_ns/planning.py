@@ -23,7 +23,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns import evidence_collection, pipeline
-from normlift_ns.api import LiftRequest, compare_with_images
 from normlift_ns.core.consensus import consensus
 from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.evidence import Evidence
@@ -689,7 +688,7 @@ class OpenedCapture(NamedTuple):
     stage_seconds: dict[str, float]
 
 
-def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
+def open_capture(request: pipeline.LiftRequest, start_time: float) -> OpenedCapture:
     """Open the capture of a request, and record the seconds of the stages `start` and `open`.
 
     Args:
@@ -705,7 +704,7 @@ def compare_cameras(opened: OpenedCapture, options: LiftOptions, device: str) ->
     """Return a warning if images and renders of some views differ; record the seconds of `kernels` and `check`."""
     opened.stage_seconds["kernels"] = time_kernel_loading(opened.scene, options, device=device)
     start = perf_counter()
-    warning = compare_with_images(opened.scene, options, device)
+    warning = pipeline.compare_with_images(opened.scene, options, device)
     opened.stage_seconds["check"] = perf_counter() - start
     return warning
 
@@ -719,7 +718,7 @@ def plan_opened(
     return make_plan(facts, num_devices=num_devices)
 
 
-def dry_run(request: LiftRequest, num_devices: int, start_time: float) -> Plan:
+def dry_run(request: pipeline.LiftRequest, num_devices: int, start_time: float) -> Plan:
     """Estimate the time, memory and disk space of a lift without running it.
 
     Args:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from normlift_ns.core.gaussians import SH_C0
-from normlift_ns.data.quantization import opacity_logits
+from normlift_ns.data.compressed_ply import opacity_logits
 from normlift_ns.data.splat import SplatFile, SplatParameters, validate_splat
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import open_regular

@@ -124,20 +124,20 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
     """Return the path of the checkpoint of a step, or of the last step if `step` is None.
 
     Raises:
-        FileNotFoundError: There is no such checkpoint. The message lists the existing steps.
+        FileNotFoundError: The folder has no such checkpoint. The message lists the existing steps.
     """
     found = sorted(folder.glob("step-*.ckpt"))
     checkpoints = {number: path for path in found if (number := _step_of(path)) is not None}
     if not checkpoints:
         raise FileNotFoundError(
-            f"There is no checkpoint in {folder}. Expected a file such as step-000029999.ckpt, which ns-train writes "
+            f"{folder} has no checkpoint. Expected a file such as step-000029999.ckpt, which ns-train writes "
             "every --steps-per-save steps and at the end. Copy it to this folder, or finish the training."
         )
     if step is None:
         return checkpoints[max(checkpoints)]
     if step not in checkpoints:
         raise FileNotFoundError(
-            f"There is no checkpoint of step {step} in {folder}, which has the steps "
+            f"{folder} has no checkpoint of step {step}, but of the steps "
             f"{', '.join(map(str, sorted(checkpoints)))}. Give one of them with --load-step, or omit --load-step for "
             "the last step."
         )
@@ -221,7 +221,7 @@ def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
         ValueError: The file is truncated or damaged, or contains other Python objects.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no file {path}. Expected a file written by torch.save; {advice}.")
+        raise FileNotFoundError(f"{path} does not exist. Expected a file written by torch.save; {advice}.")
     check_regular(path)
     _check_archive(path, advice)
     try:
@@ -344,8 +344,8 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
 def _rank_files(path: Path) -> tuple[Path, ...]:
     if not path.is_file():
         raise FileNotFoundError(
-            f"There is no checkpoint at {path}. With --load-gsplat, give a file of gsplat's simple_trainer, for "
-            "example results/garden/ckpts/ckpt_29999_rank0.pt."
+            f"{path} is not a file. With --load-gsplat, give a checkpoint of gsplat's simple_trainer, for example "
+            "results/garden/ckpts/ckpt_29999_rank0.pt."
         )
     match = _RANK.fullmatch(path.name)
     if match is None:

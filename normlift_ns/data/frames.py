@@ -212,8 +212,8 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
     """Raise if the cameras of a camera file are not valid.
 
     Raises:
-        ValueError: There are no cameras, a name occurs twice, a pose is not rigid, a number is not finite, or a focal
-            length or size is not positive. Also if only some of the cameras are fisheye cameras.
+        ValueError: The file has no cameras, a name occurs twice, a pose is not rigid, a number is not finite, or a
+            focal length or size is not positive. Also if only some of the cameras are fisheye cameras.
     """
     if len(frames) == 0:
         raise InputError(f"{source} has no cameras with images. Expected a camera for every training image.")
@@ -335,7 +335,7 @@ def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
         mask = _find_file(folder, f"{name}.png", copies=True) or _find_file(folder, name, copies=True)
         if mask is None:
             raise FileNotFoundError(
-                f"There is no mask for {name} in {folder}. Expected {Path(name).name}.png or {Path(name).stem}.png for "
+                f"{folder} has no mask for {name}. Expected {Path(name).name}.png or {Path(name).stem}.png for "
                 "every image."
             )
         masks.append(mask.absolute())

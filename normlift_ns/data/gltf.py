@@ -21,8 +21,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.core.gaussians import SH_C0
+from normlift_ns.data.compressed_ply import normalize_quats, opacity_logits, to_bytes
 from normlift_ns.data.frames import WorldTransform
-from normlift_ns.data.quantization import normalize_quats, opacity_logits, to_bytes
 from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
 from normlift_ns.data.splat_transforms import transform_splat
 from normlift_ns.data.spz import decode_spz

@@ -87,8 +87,8 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
     """Raise if a rasterizer cannot draw the Gaussians.
 
     Raises:
-        ValueError: There are no Gaussians, values are not finite, all rotations are zero, scales are not logarithms, or
-            opacities are not logits.
+        ValueError: The splat has no Gaussians, values are not finite, all rotations are zero, scales are not
+            logarithms, or opacities are not logits.
     """
     if len(splat) == 0:
         raise InputError(f"{file} contains no Gaussians. Export the scene again.")
@@ -131,7 +131,7 @@ def splat_from_parameters(parameters: Mapping[str, Tensor], file: Path) -> Splat
         parameters: Tensors by splatfacto's names.
         file: File of the tensors, for error messages.
     Raises:
-        ValueError: There are no Gaussians, or a tensor has the wrong shape or is not float16, bfloat16, float32 or
+        ValueError: The splat has no Gaussians, or a tensor has the wrong shape or is not float16, bfloat16, float32 or
             float64.
     """
     n = len(parameters["means"]) if parameters["means"].ndim > 0 else 0

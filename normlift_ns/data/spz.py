@@ -19,7 +19,7 @@ import zstandard
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.data.quantization import join_largest, normalize_quats, opacity_logits, split_largest, to_bytes
+from normlift_ns.data.compressed_ply import join_largest, normalize_quats, opacity_logits, split_largest, to_bytes
 from normlift_ns.data.splat import SH_DEGREES, SplatFile, SplatParameters, validate_splat
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import open_regular

@@ -258,8 +258,8 @@ def _pixels(path: Path, family: ModelFamily, kind: str) -> PixelNormalization:
         std = _channels(settings, "image_std", family.std, 1e-6, file)
     if kind != "siglip2":
         return PixelNormalization(factor, mean, std, _side(settings), None)
-    patches = settings.get("max_num_patches", 256)
-    if type(patches) is not int or not 1 <= patches <= (most := _MAX_SIZES["num_patches"]):
+    patches, most = settings.get("max_num_patches", 256), _MAX_SIZES["num_patches"]
+    if type(patches) is not int or not 1 <= patches <= most:
         raise InputError(f"max_num_patches of {file} is {patches!r:.40}, expected an integer in 1..{most:,}")
     return PixelNormalization(factor, mean, std, None, patches)
 

@@ -37,8 +37,8 @@ from normlift_ns.evidence_collection import (
 )
 from normlift_ns.options import LiftOptions
 from normlift_ns.pipeline import consensus_options, lift_features, min_agreement
-from normlift_ns.rasterization.backend import RasterJob
 from normlift_ns.rasterization.gsplat import check, compiled_rasterizer, project_views
+from normlift_ns.rasterization.rasterize import RasterJob
 
 Baseline = Literal["sfs", "occam", "vala", "drsplat"]
 BASELINES: dict[Baseline, str] = {

@@ -23,9 +23,10 @@ from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import choose_device
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene, facing_pose
-from normlift_ns.core.lift import Scalars, reliability
+from normlift_ns.core.lift import Scalars
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.refine import unsupported
+from normlift_ns.core.reliability import reliability
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError

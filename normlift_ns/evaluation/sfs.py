@@ -25,7 +25,7 @@ def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
     instances, or the rightmost peak if there are fewer.
 
     The valley is the nearest bin to the left that is lower than the peak and has no lower neighbor. The first bin
-    is excluded. If there is no such bin, the valley is the rightmost lower bin on the right of the peak. The threshold
+    is excluded. Without such a bin, the valley is the rightmost lower bin on the right of the peak. The threshold
     is the center of the valley.
 
     Without a peak or a valley, the threshold is the mean of Otsu's threshold on the 40 bins and the 75th percentile. If

@@ -15,11 +15,12 @@ from torch import Tensor
 
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.lift import Lifted, Scalars, reliability
+from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.lowrank import StoredDirections
 from normlift_ns.core.metrics import NO_CLASS, bin_means, classify, kendall_test, lowest_jaccard, spearman_test
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.refine import decay_width, refine, voting_weights
+from normlift_ns.core.reliability import reliability
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.baselines import BASELINES, baseline_field, time_dense_lift, timing_obstacle, with_consensus
 from normlift_ns.evaluation.options import Evaluation, ScannetOptions, mean
@@ -287,7 +288,7 @@ class SceneSignals:
     opacity: Float[Tensor, " n"]
     """Opacity in 0..1."""
     truth: Int[Tensor, " n"] | None = None
-    """Class of every Gaussian, or `NO_CLASS` for Gaussians to ignore. None if there is no ground truth."""
+    """Class of every Gaussian, or `NO_CLASS` for Gaussians to ignore. None without ground truth."""
     predictions: Mapping[str, Int[Tensor, " n"]] = field(default_factory=dict)
     """Predicted class of every Gaussian, under the keys "unrefined" and, if there was a vote, "refined"."""
 

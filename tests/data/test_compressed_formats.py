@@ -20,10 +20,9 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.data.antimatter import read_antimatter
-from normlift_ns.data.compressed_ply import encode_compressed_ply
+from normlift_ns.data.compressed_ply import encode_compressed_ply, normalize_quats
 from normlift_ns.data.gltf import encode_glb, read_gltf
 from normlift_ns.data.open_splat import _format, _read
-from normlift_ns.data.quantization import normalize_quats
 from normlift_ns.data.splat import SplatParameters, read_ply
 from normlift_ns.data.spz import encode_spz, read_spz
 from normlift_ns.errors import InputError

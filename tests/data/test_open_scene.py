@@ -282,7 +282,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({**every, "eval_images": ("1.5",)}, r"1\.5 .* between 0 and 1"),
         ({**every, "eval_images": ("list.txt",)}, r"list\.txt"),
         ({**every, "eval_images": ("cat",)}, "--eval-images .*cat"),
-        ({**every, "masks": "masks"}, r"no mask for .*0000\.png in masks"),
+        ({**every, "masks": "masks"}, r"masks has no mask for .*0000\.png"),
         ({"transforms": "t.json"}, "--colmap"),
         (every, "0 points"),
     ):
