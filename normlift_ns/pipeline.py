@@ -242,7 +242,7 @@ def run_lift(request: LiftRequest) -> LiftedRun:
 
 
 def prepare_lift(request: LiftRequest) -> PreparedLift:
-    """Load encoders, open the scene and choose the run directory, without writing any file."""
+    """Load encoders, open the scene and choose the run directory, without writing to this directory."""
     device, options = choose_device(request.device), (request.source or SourceOptions()).looking_for(request.queries)
     init_cuda(device)
     source = None
@@ -463,7 +463,7 @@ def plan_collection(
     device: str,
     export: FeatureExport | None,
 ) -> EvidenceCollection:
-    """Choose the views and the rasterizer of a lift. If the lift is impossible, raise before any image is read.
+    """Choose the views and the rasterizer of a lift, and check its inputs as far as possible without reading images.
 
     Args:
         scene, source, options, cache, device, export: As in `lift_scene`.
@@ -640,7 +640,7 @@ def measures_gate(options: LiftOptions, facts: Mapping[str, Any]) -> bool:
 
 
 def with_gate(options: LiftOptions, cosines: Float64[Tensor, " q"] | None) -> tuple[LiftOptions, dict[str, Any]]:
-    """Resolve the gate of the vote, and return it for the manifest if it was measured.
+    """Return the options with the resolved gate of the vote, and its manifest entry if it was measured.
 
     Args:
         cosines: Cosines of all processes from `shared_region_cosines`, or None for the gate of the options.

@@ -1,1 +1,1 @@
-"""Readers for trained splats and their training images, which return a `Scene` of the core."""
+"""Readers of trained splats and their training images. Together, they open a `Scene` of the core."""

@@ -21,7 +21,7 @@ MIN_PSNR = 24.0
 """Usual minimum PSNR in dB. Real scenes reach 25 to 40 dB on their training images."""
 MIN_MARGIN = 3.0
 """Minimum lead in dB over the PSNR of the images' mean color. In `python -m research.worlds`, cameras in a wrong world
-have less, and cameras in the right world have at least 1 dB more than this minimum."""
+have less. Cameras in the right world have at least 1 dB more than the minimum."""
 _MIN_VISIBLE = 0.001
 """Minimum fraction of all Gaussians that at least one view contains."""
 

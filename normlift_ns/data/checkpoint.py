@@ -329,7 +329,7 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
     splats = [splat_from_parameters(rank.parameters, file) for file, rank in zip(files, loaded)]
     steps = {rank.step for rank in loaded}
     if len(steps) > 1 or len({splat.degree for splat in splats}) > 1:
-        differing = f"steps: {', '.join(map(str, sorted(steps)))}" if len(steps) > 1 else "degrees of harmonics"
+        differing = f"steps: {', '.join(map(str, sorted(steps)))}" if len(steps) > 1 else "spherical harmonics"
         raise InputError(
             f"{files[0].parent} has ranks with different {differing}. "
             "Expected the files of one training run. Copy these files to a separate folder."

@@ -125,7 +125,7 @@ class _Saved(msgspec.Struct):
 
 
 def save_splat(folder: Path, scene: SplatScene) -> None:
-    """Write splat.json and transforms.json, which contains the cameras, into the folder of a run."""
+    """Write splat.json, and transforms.json with the cameras, into the folder of a run."""
     write_transforms(folder / TRANSFORMS_FILE, scene.train.frames, scene.held_out.frames)
     saved = _Saved(scene.name, scene.rasterize_mode, scene.background_name, str(scene.names_root), dict(scene.identity))
     write_text_file(folder / SPLAT_FILE, json.dumps(msgspec.to_builtins(saved), indent=2) + "\n")

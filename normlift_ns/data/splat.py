@@ -232,8 +232,9 @@ _MODES: dict[str, RasterizeMode] = {
 def read_ply(path: Path) -> SplatFile:
     """Read a splat from a PLY file, which may be compressed.
 
-    Properties may be in any order, and unknown properties are ignored. The property filter_3D is applied to scales and
-    opacities, as in Mip-Splatting. Peak memory is slightly more than one copy of the Gaussians.
+    Properties may be in any order. Unknown properties are ignored, except those of other primitives. The property
+    filter_3D is applied to scales and opacities, as in Mip-Splatting. Peak memory is slightly more than one copy of the
+    Gaussians.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -347,7 +348,7 @@ def _not_ply(path: Path, error: Exception) -> InputError:
 
 
 def _check_properties(path: Path, vertex: PlyElement) -> bool:
-    """Return True if the vertices are 2D Gaussians, which have two scales; raise InputError for other properties."""
+    """Return True for 2D Gaussians, which have two scales; raise InputError if properties are missing or lists."""
     names = {item.name for item in vertex.properties}
     required = [name for columns in _COLUMNS.values() for name in columns]
     missing = [name for name in required if name not in names]

@@ -153,7 +153,7 @@ class Regions(Protocol):
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """Indices of the selected levels of `labels`; empty if there is only one level."""
+        """Indices of the selected levels of `labels`. It may be empty if there is only one level."""
         ...
 
     @property

@@ -14,9 +14,9 @@ decreases with the distance between their coordinates::
 
 The cosine is 0.95 at a distance of 10 (neighboring shades), 0.61 at 30, 0.14 at 60 and 0.004 at 100. An exact phi would
 need infinitely many dimensions. This module uses the Nystroem approximation on 343 anchors, a lattice of 7 levels per
-sRGB channel. If L L^T is the kernel matrix of the anchors, and k contains the kernel values of x and each anchor,
-phi(x) is the normalized vector L^-1 k. For random pairs of sRGB colors, cosines are accurate to 4e-3, and for 99 % of
-the pairs to 1e-3.
+sRGB channel. Let L L^T be the kernel matrix of the anchors, and let k contain the kernel values of x and each anchor.
+Then phi(x) is the normalized vector L^-1 k. For random pairs of sRGB colors, cosines are accurate to 4e-3, and for 99 %
+of the pairs to 1e-3.
 """
 
 from __future__ import annotations

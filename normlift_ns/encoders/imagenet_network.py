@@ -3,7 +3,7 @@
 The classifier averages 1,280 feature maps over an image and multiplies the mean by one vector per class. The encoder
 normalizes the features and averages them over a region, so that all pixels count equally. The cosine of this mean and a
 class vector measures how much the region looks like the class. Features are 32 pixels apart, so the image is encoded at
-twice its size, or at about 2,048 pixels on its longer side if that is less.
+twice its size. Its longer side is limited to about 2,048 pixels.
 
 Convolutions are padded equally on both sides, so that feature (i, j) is centered on pixel (32 i, 32 j). An image with
 32 m + 1 rows has m + 1 rows of features, from its first to its last row. TensorFlow, which was used for training, pads
@@ -159,7 +159,7 @@ class ImageNetEncoder:
         a query needs one vector.
 
         Raises:
-            InputError: If `prompts` or a prompt is empty, or a prompt does not name a class.
+            InputError: If `prompts` or a prompt is empty, a prompt does not name a class, or the weights are damaged.
             FileNotFoundError: If the weights are not on this machine.
         """
         check_prompts(prompts)

@@ -364,8 +364,8 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
     Args:
         device: Device of the network, such as "cuda"; results are always on the CPU.
     Raises:
-        ValueError: If the encoder, the model or the weights tag is unknown, the prompt template has no placeholder, or
-            an encoder of another package rejects the options.
+        ValueError: If the encoder, the model or the weights tag is unknown, or the prompt template has no placeholder.
+            Also if an encoder of another package rejects the options.
         FileNotFoundError: If a weight file does not exist.
     """
     from normlift_ns.encoders.plugins import PluginEncoder  # noqa: PLC0415 (needs torch)

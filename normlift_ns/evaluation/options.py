@@ -31,7 +31,7 @@ MAX_SUGGESTED_POSES = 5
 
 
 def pose_output_paths(stem: Path) -> tuple[Path, ...]:
-    """Return all paths of files for new poses, which are a camera path and a render of each pose.
+    """Return the paths of all files for new poses: the camera path, and the render of each pose.
 
     >>> [path.name for path in pose_output_paths(Path("next"))][:2]
     ['next_camera_path.json', 'next_pose_1.png']

@@ -304,9 +304,9 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
     p-values `…_p`. `opacity.jaccard` is the Jaccard index of the fifth with the lowest R and the fifth with the lowest
     opacity. `opacity.quintile1` … are mean opacities by ascending R.
 
-    With ground truth, `reliability.bin1` … `bin10` and `norm.bin1` … are the accuracies of unrefined predictions in ten
-    bins of equal count, by R and by ||f||. `….spearman_bins` is their rank correlation with the bin number.
-    `histogram.0.00` … are shares by R.
+    With ground truth, `reliability.bin1` … are the accuracies of unrefined predictions in ten bins of equal count by R.
+    `norm.bin1` … are those by ||f||. `….spearman_bins` is their rank correlation with the bin number. `histogram.0.00`
+    … are shares by R.
 
     The p-values assume that Gaussians are independent, but neighbors are not independent.
     """

@@ -98,7 +98,7 @@ def distorted(k1: float):
         (focal(1.02), "Focal lengths that are (.*)% shorter", 1.96),
         (focal(0.98), "Focal lengths that are (.*)% longer", 2.04),
         (focal(1.25), "Focal lengths that are (.*)% shorter", 20),
-        (moved(8), "principal point that lies (.*) pixels left", 8),
+        (moved(8), "principal point that is shifted by (.*) pixels left", 8),
         (distorted(0.1), "k1 that is higher by (.*) fits", 0.1),
         (noisy, "([0-9]*) dB or more is usual", 24),
     ],

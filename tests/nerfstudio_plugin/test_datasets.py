@@ -97,7 +97,7 @@ def test_cameras_that_no_training_had_are_named(copied: Path) -> None:
     frame, keep = whole["frames"][0], whole["frames"][1:]
     turned = [[float("nan"), 0, 0, 0], *frame["transform_matrix"][1:]]
     cases: list[tuple[dict[str, Any] | str, str]] = [
-        ({"frames": [frame]}, "1 cameras .* same position"),
+        ({"frames": [frame]}, "same position .*: 1"),
         ({"frames": [frame, {**frame, "file_path": "images/001.jpg"}]}, "2 cameras .* same position"),
         ({"frames": [{**frame, "transform_matrix": turned}]}, "NaN"),
         ({"w": 10**9}, "w is 1e[+]09"),
@@ -147,8 +147,8 @@ def test_a_damaged_transform_of_the_training_switches_nothing_off(copied: Path) 
     path, unit = copied.parent / "dataparser_transforms.json", np.eye(4)[:3].tolist()
     cases: list[tuple[Any, str]] = [
         ({"transform": unit, "scale": float("nan")}, "NaN"),
-        ({"transform": unit, "scale": 0}, "3 rows and scale 0"),
-        ({"transform": unit[:2], "scale": 1}, "2 rows and scale 1"),
+        ({"transform": unit, "scale": 0}, "rows: 3, scale: 0"),
+        ({"transform": unit[:2], "scale": 1}, "rows: 2, scale: 1"),
         ({"transform": [[1, 2], [3]], "scale": 1}, "transform"),
         ({"scale": 1}, "`transform`"),
         ({"transform": unit, "scale": True}, "`float`, got `bool`"),
@@ -260,7 +260,7 @@ def test_datasets_of_another_machine(copied: Path, start: str) -> None:
     file = folder / trained[2]
     file.rename(folder / "elsewhere.jpg")
     for how in ({}, {"data": folder}):
-        with pytest.raises(FileNotFoundError, match=r"1 of 9 image files.*002|003") as caught:
+        with pytest.raises(FileNotFoundError, match=r"1 of 9, .*00[23]") as caught:
             opened(copied, **how)
         assert ("--data" in str(caught.value)) == (how == {})  # not what was done already
     path.unlink()

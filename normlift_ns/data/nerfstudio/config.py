@@ -121,7 +121,7 @@ class ConfigPaths:
     output_dir: Path | None
     """Folder that contains the experiment folder."""
     data: tuple[Path, ...]
-    """Possible paths of the dataset; empty if the config has none."""
+    """Possible paths of the dataset; empty if they are unknown."""
 
 
 def read_config_paths(path: Path) -> ConfigPaths:

@@ -1,4 +1,4 @@
-"""Reader for trained splatfacto runs, which returns a `Scene` with the images that splatfacto trained on."""
+"""Reader of trained splatfacto runs. It returns a `Scene` with the images that splatfacto trained on."""
 
 from __future__ import annotations
 
