@@ -61,9 +61,9 @@ class LerfOptions(CheckedOptions):
 
     masking: Masking = "background"
     """Conversion of scores to masks. background selects pixels whose score exceeds that of every background word by
-    more than --margin. auto applies SFS's threshold from the histogram. langsplat thresholds LERF's relevancy of unit
-    features per pixel, as in LangSplat. langsplat_composited does so for composited scores, without normalizing
-    features."""
+    more than --margin. auto uses a threshold from the histogram of the scores in the image, as Splat Feature Solver
+    (SFS) does. langsplat thresholds LERF's relevancy of composited features, normalized per pixel, as in LangSplat.
+    langsplat_composited computes this relevancy from composited scores instead."""
     margin: float = MASK_MARGIN
     """Lead over the best background word for --masking background, in cosine. Larger values give smaller masks. SFS's
     code uses 0."""
@@ -74,8 +74,8 @@ class LerfOptions(CheckedOptions):
     """Open and close each mask, keep its largest component and fill its holes, as in SFS's code. The image border
     becomes empty. The paper does not specify this step."""
     scale: Literal["unit", "norm"] = "unit"
-    """Scores to composite. unit composites cosines. norm composites cosines times ||f||, as in SFS, which does not
-    normalize features."""
+    """Scores to composite. unit composites cosines. norm composites cosines times ||f||, the norm of the mean feature,
+    as in SFS, which does not normalize features."""
 
 
 @dataclass(frozen=True)
