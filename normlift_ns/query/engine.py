@@ -40,14 +40,14 @@ if TYPE_CHECKING:
     from normlift_ns.core.field import SemanticField
 
 Verdict = Literal["found", "weak match", "probably not here"]
-"""Presence of a prompt in a scene. found: the prompt matches better than almost all unrelated words.
-weak match: it matches better than most of them. probably not here: it does not."""
+"""Presence of a prompt in a scene; see `judge`. With null words, found: the prompt matches better than 90 % of them.
+weak match: it matches better than 70 % of them. probably not here: it does not."""
 _CENTRAL = (0.05, 0.95)
 """Quantiles of the selected centers that bound their extent."""
 _SUMMARIZED = ("reliability", "weight")
 """Scalars per Gaussian from which the summary of a prompt is computed."""
 _THREADS = min(8, os.cpu_count() or 1)
-"""Number of prompts that are summarized concurrently."""
+"""Maximum number of prompts that are summarized concurrently."""
 
 
 class QueryField(HasManifest, Protocol):
@@ -228,7 +228,7 @@ class Finding:
 
     @property
     def peak(self) -> float | None:
-        """Highest relevancy of a Gaussian that has a direction."""
+        """Highest relevancy of a Gaussian that has a direction; None if no Gaussian has one."""
         valid = self.answer.valid
         return float(self.relevancy[valid].max()) if bool(valid.any()) else None
 
@@ -248,14 +248,14 @@ class Finding:
     def verdict(self) -> Verdict | None:
         """Presence of the prompt in the scene; None if there is nothing to compare its cosines with.
 
-        The verdict on a prompt that selects Gaussians is weak match or found.
+        For a prompt that selects Gaussians, a weak match replaces "probably not here".
         """
         verdict = self.answer.verdicts[self.index]
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
 
     @property
     def read_as(self) -> str | None:
-        """Words of the prompt that the encoder uses; None if it uses all words except articles, or none."""
+        """Words of the prompt that the encoder uses; None if it ignores at most articles, or all words."""
         kind = find_encoder_kind(encoder_name(self.answer.field))
         known = "" if kind is None else kind.known_words(self.text)
         ignored = set(re.findall(r"\w+", self.text.lower())) - set(re.findall(r"\w+", known.lower()))
@@ -265,7 +265,8 @@ class Finding:
     def nearest(self) -> list[float] | None:
         """Position that is most similar to the prompt, even if no Gaussian is selected there.
 
-        It is the weighted mean center of the 0.1 % of the Gaussians that have the highest relevancy.
+        It is the weighted mean center of the 0.1 % of the Gaussians that have the highest relevancy. It is None if no
+        Gaussian has a direction.
         """
         if self.histogram is None:
             return None
@@ -280,7 +281,7 @@ class Finding:
 
     @property
     def objects(self) -> list[SceneObject]:
-        """Objects of the selection, which are its connected components, by descending size."""
+        """Objects of the selection, its connected components of at least 20 Gaussians, by descending size."""
         from normlift_ns.analysis.objects import find_objects  # noqa: PLC0415 (needs torch)
 
         return find_objects(self.answer.field, self.answer.means, self.mask).objects
@@ -448,6 +449,7 @@ class Histogram:
     threshold: float
     """Relevancy above which a Gaussian is selected."""
     median: float
+    """Median relevancy; the smallest one if more than half of the Gaussians are at the top."""
     top: float
     """Relevancy that one Gaussian in a thousand exceeds."""
     suggested: float
