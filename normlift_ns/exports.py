@@ -42,7 +42,7 @@ from normlift_ns.rendering.figures import write_masks
 SplatFormat = Literal["ply", "compressed_ply", "glb", "spz", "spz4"]
 """File format of an exported splat. spz is version 3 of SPZ, which more programs support; spz4 is version 4."""
 _FORMATS: dict[str, SplatFormat] = {".compressed.ply": "compressed_ply", ".glb": "glb", ".spz": "spz"}
-"""Formats by the ending of a file name. All other endings mean PLY."""
+"""Formats by the ending of a file name. All other endings mean PLY, except those in `_UNWRITTEN`."""
 _UNWRITTEN = (".splat", ".sog", ".ksplat", ".gltf")
 MIN_OPACITY_LOGIT = -5.5373
 """Logit of the opacity 1/255 as rounded in ns-export, which leaves out Gaussians with a lower opacity."""
@@ -53,7 +53,7 @@ _MAX_COMMENT_LENGTH = 60
 def semantic_columns(field: SemanticField, answer: Answer | None, instances: Instances | None) -> dict[str, np.ndarray]:
     """Return columns by name: reliability, n_eff, relevancy_0, … in float32, and class_id and instance_id in uint32.
 
-    Ids are unsigned because splat converters turn -1 into 4294967295.
+    Ids are unsigned, with 0 for none, because splat converters turn -1 into 4294967295.
     """
     if answer is not None and len(answer.relevancy) != len(field):
         raise InputError(
@@ -166,25 +166,21 @@ def write_splat(
 
     Args:
         path: Path of the file.
-        splat: The Gaussians. The file records the rasterization mode only if it is "antialiased", because other tools
-            assume "classic" by default.
+        splat: The Gaussians. GLB files record the rasterization mode. Other files record it only if it is
+            "antialiased", because other tools assume "classic" by default.
         keep: Mask of the Gaussians to write. Those that `exportable_rows` leaves out are skipped.
         file_format: Format of the file. If None, the ending of the file name selects it; see `_FORMATS`.
         overwrite: Replace existing files.
     Raises:
         FileExistsError: A file exists, and `overwrite` is False.
-        ValueError: No Gaussian is left to write, `labels.objects` cannot be encoded as JSON, or a Gaussian is too far
-            from the origin for SPZ.
+        ValueError: No Gaussian is left to write, the file name has the ending of an unsupported format,
+            `labels.objects` cannot be encoded as JSON, or a Gaussian is too far from the origin for SPZ.
         OSError: A file cannot be written, for instance because the disk is full.
     """
     columns = splat.columns()
     rows = exportable_rows(columns, keep)
     if len(rows) == 0:
-        count, why = int(keep.sum()), "opacity below 1/255, or parameters that are not finite"
-        reason = f"all {count:,} selected Gaussians are invisible ({why})"
-        raise InputError(
-            f"{path} is not written: {reason if count > 0 else 'no Gaussian is selected'}; select other Gaussians"
-        )
+        raise InputError(f"{path} is not written: {_reason_for_no_rows(int(keep.sum()))}")
     if labels.answer is not None and labels.instances is None:
         labels = labels._replace(instances=answer_instances(labels.answer))
     kind = file_format or _named_format(path)
@@ -210,6 +206,14 @@ def write_splat(
         for draft, text in zip(drafts[2:], documents.values()):
             draft.write_text(text, "utf8")
     return WrittenSplat(rows, remarks)
+
+
+def _reason_for_no_rows(selected: int) -> str:
+    """Return the reason why none of the selected Gaussians can be written, with its cure."""
+    if selected == 0:
+        return "no Gaussian is selected; select at least one"
+    subject = "the only selected Gaussian is" if selected == 1 else f"all {selected:,} selected Gaussians are"
+    return f"{subject} invisible (opacity below 1/255, or parameters that are not finite); select visible Gaussians"
 
 
 def _named_format(path: Path) -> SplatFormat:
@@ -358,7 +362,7 @@ def read_cloud(path: Path) -> PlyData:
     """
     expected = "Expected a point cloud or mesh in PLY format whose vertices have x, y and z."
     if not path.is_file():
-        raise FileNotFoundError(f"{path}, given with --transfer, does not exist. {expected}")
+        raise FileNotFoundError(f"{path}, the point cloud to label, does not exist. {expected}")
     check_ply_header(path)
     try:
         cloud = PlyData.read(str(path), mmap="c")
@@ -402,7 +406,8 @@ def label_cloud(
     """
     if len(means) == 0:
         raise InputError(
-            "The cloud cannot be labeled because all Gaussians are invisible (opacity below 1/255). Give another run."
+            "The cloud cannot be labeled because all Gaussians of the run are invisible (opacity below 1/255, or "
+            "parameters that are not finite). Give another run."
         )
     means = means if transfer.to_cloud is None else transfer.to_cloud.transform_points(means)
     spacing = nearest_neighbors(torch.from_numpy(means), 1).spacing

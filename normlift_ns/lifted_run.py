@@ -157,12 +157,14 @@ class LiftedRun:
             texts: Prompts for the text encoder of the run.
             vectors: Vectors [D] of further prompts by name, in the space of the features. They may have any norm > 0,
                 and need no text encoder unless the rule compares with negatives.
-            negatives: Negative prompts to compare with. If None, use those of the encoder.
-            relevancy: Formula that computes relevancy from cosines; see `normlift_ns.relevancy`. "auto" is contrast if
-                the lift compared the scene with unrelated words, else lerf with negatives, else cosine.
+            negatives: Negative prompts for the rules lerf and margin. If None, use those of the encoder, or else
+                `CANONICAL_NEGATIVES`.
+            relevancy: Formula that computes relevancy from cosines; see `normlift_ns.relevancy`. "auto" is lerf if
+                `negatives` has prompts. Otherwise, it is contrast if the lift compared the scene with unrelated words,
+                else the default rule of the encoder.
             threshold: Relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
-                relevancies. None means 0.02 for the rule margin, "auto" for the rule cosine with encoders other than
-                "color", and otherwise 0.5.
+                relevancies. None means 0.5 for contrast and lerf, 0.02 for margin, and "auto" for cosine, unless the
+                encoder sets a threshold for its default rule, such as 0.7 for "color".
             min_reliability: Minimum reliability R of selected Gaussians, in 0..1.
             refined: Use the directions after the vote.
         Raises:
@@ -222,8 +224,7 @@ class LiftedRun:
         question = question.question if isinstance(question, Answer) else question
         if question.embeddings.shape[1] != self.field.dimension:
             raise InputError(
-                f"the query has vectors of {question.embeddings.shape[1]} numbers, but the features of "
-                f"{self.folder} "
+                f"the query has vectors of {question.embeddings.shape[1]} numbers, but the features of {self.folder} "
                 f"have {self.field.dimension}; query this run again, and save the new answer"
             )
         return save_query(self.folder / FIELD_FOLDER, question)
@@ -255,13 +256,14 @@ class LiftedRun:
             objects: Table to write to <stem>_objects.json, with JSON types only.
             object_max_gap: Maximum gap between Gaussians of one object, as in `find_objects`.
             object_min_gaussians: Minimum number of Gaussians in an object, as in `find_objects`.
-            overwrite: Replace files of these names. Without `objects`, also remove an earlier table of objects.
+            overwrite: Replace files of these names, and remove an earlier <stem>_names.json or <stem>_objects.json that
+                this export does not write.
         Returns:
             The row indices of the written Gaussians, in the order of the file.
         Raises:
             FileExistsError: A file exists and `overwrite` is False.
-            ValueError: All Gaussians of `part` are invisible, or the mask has the wrong type or length. Also if the
-                name is reserved for files of a run, or the options of objects are given without an answer.
+            ValueError: No Gaussian of `part` is visible, or the mask has the wrong type or length. Also if the name is
+                reserved for files of a run, or the options of objects are given without an answer.
         """
         path = check_path("path", path)
         if path.name in ("", ".."):
@@ -297,7 +299,7 @@ class LiftedRun:
         """Write a PNG mask for each training image, with the size of the image, and return the paths.
 
         A pixel is 255 if the selection makes up more than half of it, else 0. Gaussians in front occlude the selection.
-        The masks fit the images after the undistortion of the training.
+        The masks fit the undistorted images that the scene was trained with.
 
         Args:
             folder: Folder to write to.
@@ -330,7 +332,8 @@ class LiftedRun:
     ) -> exports.LabelTransfer:
         """Label a point cloud or mesh with the semantics of the nearest Gaussians, and write it to a new PLY file.
 
-        Each point gets the relevancies, class_id and instance_id of its nearest Gaussian.
+        Each point gets the relevancies, class_id and instance_id of its nearest visible Gaussian, or 0 if it is too far
+        away.
 
         Args:
             cloud: PLY file to read.
@@ -338,11 +341,11 @@ class LiftedRun:
             part: Answer that provides the labels, or a finding of that answer.
             transfer_distance: Maximum distance from a point to the center of its Gaussian, in units of the median
                 spacing of the Gaussians.
-            coordinates: Coordinate system of the cloud. "capture" is the system of the cameras before nerfstudio
-                rotated and scaled them, and "scene" that of the Gaussians.
+            coordinates: Coordinate system of the cloud. "capture" is that of the original cameras, before the training
+                rotated and scaled them, and "scene" is that of the Gaussians.
             overwrite: Replace a file of that name.
         Raises:
-            FileNotFoundError: The cloud does not exist.
+            FileNotFoundError: The cloud does not exist, or the run has no dataparser_transforms.json for "capture".
             FileExistsError: A file exists and `overwrite` is False.
             ValueError: `part` has no answer, the cloud is not a PLY file or already has properties of these names, or
                 the distance is not positive.
@@ -442,13 +445,13 @@ class LiftedRun:
 
         An object is named after the best word of the vocabulary. The word must have the verdict "found" and select more
         than half of the object. It must also match better than chance, which is estimated from the 200 unrelated words
-        of the encoder, or from a vocabulary of at least 100 words. The color encoder skips this test. Other objects are
-        called "object 1", "object 2" and so on.
+        of the encoder, or from a vocabulary of at least 100 words. Without either, and for the color encoder, this test
+        is skipped. Other objects are called "object 1", "object 2" and so on.
 
         Args:
-            vocabulary: Candidate names of objects. If None, use the words of the encoder: the 1,000 classes of
-                imagenet, the names of colors, or the texts of your own features. With other encoders, objects are only
-                numbered.
+            vocabulary: Candidate names of objects. If None, use the texts of the run's file of text embeddings, or else
+                the words of the encoder: the 1,000 classes of imagenet, or the names of colors. With other encoders,
+                objects are only numbered.
             meters_per_unit: As in `catalogue`.
         Raises:
             ValueError: The encoder cannot encode a word, or as in `why` and `catalogue`.
@@ -543,7 +546,7 @@ class LiftedRun:
         ]
         if len(matches) > 1:
             options = ", ".join(names[i] for i in matches)
-            raise InputError(f"{len(matches)} training images are called {name!r}: {options}; include the folder")
+            raise InputError(f"{len(matches)} training images are called {name!r}; give one of these names: {options}")
         if len(matches) == 0:
             raise _no_image(repr(name), names)
         return cameras[matches[0]]

@@ -30,11 +30,11 @@ from normlift_ns.registry import installed_names
 _MAX_INT, _MAX_FLOAT = 2**31 - 1, 1e30
 """Default upper bounds of integer and float options. They prevent overflow in int32 and float32."""
 _MIN_DIVISOR = 1e-6
-"""Lower bound of options that are used as divisors."""
+"""Lower bound of most positive options, because some of them are used as divisors."""
 MAX_PROMPT_LENGTH = 10_000
 """Maximum number of characters in a prompt. CLIP encodes only about the first 70 words."""
 _INVALID = re.compile("[\0\ud800-\udfff]")
-"""Characters that files and encoders cannot store: NUL, and surrogates, which UTF-8 cannot encode."""
+"""Characters that prompts and text options cannot have: NUL, and surrogates, which UTF-8 cannot encode."""
 _IMPOSSIBLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR)
 """Error numbers for a name that is too long, a loop of links, and a file that is used as a folder."""
 _hints = cache(get_type_hints)
@@ -105,7 +105,7 @@ def named_as_flags() -> Iterator[None]:
 
 
 VOTE_FLAGS = {name: f"vote_{name}" for name in ("k", "sigma_d", "tau", "gamma", "delta", "min_labeled", "prior")}
-"""Command-line names of the fields of `RefineConfig`."""
+"""Command-line names of the fields of `RefineConfig` except `vote`, with underscores and without leading dashes."""
 
 
 def option_name(name: str) -> str:
@@ -240,7 +240,7 @@ def check_options(options: Any) -> None:
 
 
 class CheckedOptions:
-    """Base class of options dataclasses that checks the fields of new instances with `check_options`."""
+    """Base class of options dataclasses. It checks the fields of each new instance with `check_options`."""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -282,18 +282,19 @@ def check_device(device: Any) -> str:
     'cuda:0'
     """
     if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", str(device), re.ASCII):
-        raise InputError(f"--device must be auto, cpu or cuda, got {short_repr(str(device))}")
+        raise InputError(f"--device must be auto, cpu or cuda, or a GPU such as cuda:1; got {short_repr(str(device))}")
     return str(device)
 
 
 def check_prompt_list(name: str, texts: Sequence[str]) -> None:
-    """Check a list of prompts.
+    """Check a list of prompts, which may be empty.
 
     Args:
         name: Name of the option, for messages.
         texts: List of prompts.
     Raises:
-        InputError: The prompts are not a list, or a prompt is empty, repeated, too long or has an invalid character.
+        InputError: `texts` is a single string, or a prompt is not a string, or is empty, repeated or too long, or has
+            an invalid character.
     """
     if isinstance(texts, str):
         raise InputError(f"{option_name(name)} must be a list of prompts, got the single prompt {short_repr(texts)}")
@@ -431,7 +432,7 @@ UnlabeledMode = Literal["ignore", "dilute"]
 """Treatment of pixels without a region: ignored, or counted as observations of the zero vector."""
 
 RegionKind = Literal["auto", "sam", "sam3", "edges", "patches", "superpixel", "grid", "files"]
-"""Built-in kinds of image regions."""
+"""Built-in values of --regions."""
 MASK_GROUP = "normlift_ns.masks"
 """Entry point group of mask sources; their names are further values of --regions."""
 FeatureKind = Literal["none", "langsplat"]
@@ -453,11 +454,12 @@ ReliabilityKind = Literal["paper", "pairs", "angular"]
 WithoutDirection = Literal["none", "first"]
 """Class that an evaluation assigns to Gaussians without a direction: no class, or the first class."""
 OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS = 4.0, 20
-"""Maximum gap within an object, in units of the selection's median spacing, and minimum number of Gaussians in it."""
+"""Default maximum gap within an object, in units of the selection's median spacing, and default minimum number of
+Gaussians in an object."""
 LABEL_ARRAY_FILES = ("coord.npy", "segment.npy", "instance.npy", "names.json")
 """Names of the files of exported label arrays."""
 MAX_TRANSFER_DISTANCE = 6.0
-"""Maximum distance from a point to the Gaussian that labels it, in units of the scene's median spacing."""
+"""Default maximum distance from a point to the Gaussian that labels it, in units of the scene's median spacing."""
 CATALOG_FILES = ("objects.json", "objects.csv", "objects.ply", "objects_scene.ply")
 """Files of an object catalog: all values, the table, and boxes in capture and in scene coordinates."""
 WEAK_RELIABILITY = 0.6
@@ -485,13 +487,13 @@ class SourceOptions:
     """Encoder of regions and prompts. open_clip: CLIP, applied to masked crops or to patches. siglip, siglip2,
     metaclip2: networks of the transformers library, applied in the same way. imagenet: a small classifier; prompts are
     names of its 1,000 classes, or of groups of classes such as dog. Fetch its weights with ns-normlift-weights --get
-    imagenet. color: mean colors, compared with color names; needs no weights. auto: the first of open_clip, siglip2,
-    siglip, metaclip2, imagenet and color whose default weights are on this machine. Any other name: an encoder from an
-    installed plugin."""
+    imagenet. color: mean colors, compared with color names; needs no weights. auto: open_clip if its options or
+    --features langsplat are given. Otherwise, auto selects the first of open_clip, siglip2, siglip, metaclip2, imagenet
+    and color whose default weights are on this machine. Any other name: an encoder from an installed plugin."""
     encoder_model: str = DEFAULT_MODEL
     """Network of the encoder. open_clip: the name of an architecture. siglip, siglip2, metaclip2: a Hugging Face model
-    name or a local folder. Without this option, these three use google/siglip-base-patch16-224,
-    google/siglip2-base-patch16-224 and facebook/metaclip-2-worldwide-huge-quickgelu."""
+    name or a local folder. Without this option, siglip uses google/siglip-base-patch16-224, siglip2 uses
+    google/siglip2-base-patch16-224, and metaclip2 uses facebook/metaclip-2-worldwide-huge-quickgelu."""
     encoder_pretrained: str = DEFAULT_PRETRAINED
     """Pretrained weights for open_clip: a tag to download, or a local file for the same architecture."""
     crop_fill: CropFill = "black"
@@ -500,13 +502,14 @@ class SourceOptions:
     """Template of the text that the network encodes. {} stands for the prompt, as in "a photo of a {}". {} alone
     encodes the bare prompt. ensemble: average the vectors of seven OpenCLIP templates."""
     regions: str = "auto"
-    """Image regions, each of which gets one feature. sam: masks of SAM. sam3: masks of SAM 3 for the prompts of
-    --queries. edges: regions bounded by edges from a small network; fetch its weights with ns-normlift-weights --get
-    edges. patches: patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
-    --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise, auto depends on the encoder. For
-    a neural network on a GPU, auto selects the first of sam, edges and patches that this machine and the network
-    support. On a CPU, it never selects sam, and it prefers patches to edges for encoders that encode crops. In all
-    other cases, auto selects superpixel. Any other name: a mask source from an installed plugin."""
+    """Image regions, each of which gets one feature. sam: masks of SAM. sam3: masks of SAM 3 for text prompts; see
+    --sam3-prompts. edges: regions bounded by edges from a small network; fetch its weights with ns-normlift-weights
+    --get edges. patches: patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label
+    maps from --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise, auto selects
+    superpixel for the encoder color. For a neural network, it selects the first of sam, edges and patches that this
+    machine and the network support, or else superpixel. On a CPU, it skips sam. It also skips edges there if the
+    network supports patches but would encode each region as a crop. Any other name: a mask source from an installed
+    plugin."""
     sam3_prompts: tuple[str, ...] = ()
     """Prompts for the masks of --regions sam3. If there are none, SAM 3 uses the prompts of --queries."""
     region_count: int | None = None
@@ -580,13 +583,14 @@ class SplatOptions:
     masks: Path | None = None
     """Folder with one mask per image. The lift ignores pixels with a mask value of zero."""
     world_transform: Path | Literal["auto"] | None = "auto"
-    """Transform from the world of the cameras to that of the splat. auto: search for a rotation, normalization or
-    scaling that common tools apply, and use it only if the splat does not fit its images without it. A path: a file
-    with a similarity transform as a 4 x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY
-    file. None: no transform, without a search."""
+    """Transform from the world of the cameras to that of the splat. auto: if the splat does not fit its images, search
+    for a rotation, normalization or scaling that common tools apply. A path: a file with a similarity transform as a 4
+    x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY file. None: no search, and no
+    transform except that of --gsplat-normalize."""
     gsplat_normalize: bool = True
-    """Assume that gsplat's trainer normalized the world, which is its default, and recompute the transform from the
-    COLMAP project. For a PLY file, --world-transform auto tries this transform among others."""
+    """For a splat from gsplat's trainer: assume that the trainer normalized the world, unless its cfg.yml says
+    otherwise, and recompute this transform from the COLMAP project. For other splats, --world-transform auto also tries
+    this transform."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None
@@ -597,15 +601,15 @@ class SplatOptions:
     """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction such as
     0.1, which is the default of ns-train."""
     rasterize_mode: RasterizeMode | None = None
-    """Rasterization mode that the splat was trained with. Default: as recorded in the file or in the cfg.yml of
-    gsplat's trainer, else classic."""
+    """Rasterization mode that the splat was trained with. None: as recorded in the file, in the cfg.yml of gsplat's
+    trainer or in the cfg_args of Inria's trainer, else classic."""
     primitive: Primitive | None = None
-    """Kind of the Gaussians. 2dgs: the flat Gaussians of 2D Gaussian Splatting, whose third scale is not used. Default:
+    """Kind of the Gaussians. 2dgs: the flat Gaussians of 2D Gaussian Splatting, whose third scale is not used. None:
     2dgs if gsplat's trainer recorded 2D Gaussians, the PLY file has two scales, or the file name contains 2dgs;
     otherwise 3dgs."""
     background: Background | None = None
-    """Background color behind the splat, and behind images with an alpha channel. Default: as in the cfg_args of
-    Inria's trainer, else black."""
+    """Background color behind the splat, and behind images with an alpha channel. None: as in the cfg_args of Inria's
+    trainer, else black."""
 
     def __post_init__(self) -> None:
         if isinstance(self.eval_images, str | float):
@@ -614,7 +618,7 @@ class SplatOptions:
 
 
 class VoteParameters(NamedTuple):
-    """Vote parameters whose defaults depend on the kind of vote."""
+    """Vote parameters that have a default for each kind of vote."""
 
     sigma_d: float
     tau: float
@@ -635,7 +639,7 @@ class RefineConfig(CheckedOptions):
     """Parameters of the vote among neighboring Gaussians.
 
     The paper publishes no values, so the defaults were tuned on scenes with ground truth; see docs/accuracy.md. A
-    parameter that is None takes the default of the kind of vote.
+    parameter that is None takes the default of the kind of vote. A lift may instead measure tau and gamma.
 
     Raises:
         ValueError: A value is out of range.
@@ -657,11 +661,11 @@ class RefineConfig(CheckedOptions):
     median distance from a Gaussian to the nearest one at another position. None: 2 for posterior, 1 for paper."""
     tau: float | None = None
     """Cosine at which the agreement of two directions is one half, in -1..1. Larger values require more similar
-    directions. None: 0.95 for paper. For posterior, 0.9, unless the consensus changed features; tau is then measured on
-    neighbors that share regions."""
+    directions. None: 0.95 for paper. For posterior, a lift measures tau on neighbors that share regions if the
+    consensus changed features and there are at least 50 such pairs, and otherwise uses 0.9."""
     gamma: float | None = None
     """Softness of the agreement around the cosine --vote-tau, > 0. Larger values blur the distinction between similar
-    and different directions. None: 0.4 for paper. For posterior, 0.05, or (1 - tau) / 2 if tau is measured."""
+    and different directions. None: 0.4 for paper. For posterior, (1 - tau) / 2 if tau is measured, else 0.05."""
     delta: float | None = None
     """Margin Delta by which the best neighbor must win the vote, >= 0. Larger values change fewer Gaussians.
     None: 0."""
@@ -705,12 +709,12 @@ class LiftOptions(CheckedOptions):
     lift_downscale: int = 1
     """Divisor of the size of images and cameras, at least 1. Larger values are faster and coarser."""
     reliability_beta: float = 1.0
-    """Strength of the prior in the reliability, in virtual views, >= 0. Larger values lower the reliability of
+    """Strength beta of the prior in the reliability R, as a number of views, >= 0. Larger values lower R, most for
     Gaussians with few views."""
     reliability: ReliabilityKind = "paper"
     """Reliability R to store. paper: equation 8 of the paper. pairs: agreement of pairs of views, so that a Gaussian
-    with only one view is not reliable. angular: as pairs, but views from nearby cameras count less. The vote always
-    uses paper."""
+    with only one view has R <= 0.02. angular: as pairs, but views from nearby cameras count less. The vote always uses
+    paper."""
     unlabeled: UnlabeledMode = "ignore"
     """Treatment of pixels without a region. ignore: leave them out. dilute: count them as observations of the zero
     vector."""
@@ -726,18 +730,20 @@ class LiftOptions(CheckedOptions):
     """Minimum number of Gaussians that the consensus samples in each region, at least 1. Regions with fewer Gaussians
     use all of them. Larger values are more exact and slower. Needs --consensus True."""
     consensus_min_agreement: float | None = None
-    """Agreement of regions across views, in 0..1, up to which the consensus leaves features unchanged because overlaps
-    may be random. Larger values disable the consensus in more scenes. Use 0 if each region shows one object, even
-    roughly. None: 0 for masks of SAM and for regions between edges, 0.4 for others. Needs --consensus True."""
+    """Agreement of regions across views, in 0..1, that the scene must exceed for the consensus to change features. At
+    lower agreement, overlaps may be random. Larger values disable the consensus in more scenes. Use 0 if each region
+    shows roughly one object. None: 0 for masks of SAM and for regions between edges, 0.4 for others. Needs --consensus
+    True."""
     recognition: bool = True
-    """Report how well regions of one half of the views are recognized from the other half, and vice versa. Use the
-    report to compare captures, encoders and settings without labels. It does not change the result, and takes a few
-    seconds."""
+    """Measure how well a lift of half of the views recognizes the regions of the other half, for both halves. Use the
+    result to compare captures, encoders and settings without labels. The measurement does not change the lift, and
+    takes a few seconds."""
     refine: bool = True
-    """Repair directions by a vote among neighboring Gaussians. Each Gaussian copies the direction that wins."""
+    """Repair directions by a vote among neighboring Gaussians. A Gaussian copies the direction of a neighbor that wins
+    the vote, or keeps its own."""
     vote: RefineConfig = field(default_factory=RefineConfig)
     tolerance: float = 1e-3
-    """Maximum error that storage may add to any cosine, > 0. Larger values give smaller files."""
+    """Maximum error that --storage auto or low_rank may add to any cosine, > 0. Larger values give smaller files."""
     storage: Storage | Literal["auto"] = "auto"
     """Storage format of directions. evidence: the exact evidence. float16: half-precision vectors. low_rank:
     coordinates in a low-rank basis. auto: the smallest format within --tolerance."""
@@ -771,17 +777,18 @@ class AskOptions:
     """
 
     negatives: tuple[str, ...] | None = None
-    """Negative prompts to compare with. None: the negatives of the encoder, which are object, things, stuff and texture
-    (from LERF) for text encoders. imagenet and color have none."""
+    """Negative prompts for the formulas lerf and margin. None: those of the encoder, or else object, things, stuff and
+    texture (from LERF)."""
     relevancy: RelevancyRule | Literal["auto"] = "auto"
     """Relevancy formula. contrast: the softmax against unrelated words at every Gaussian. cosine: the cosine itself.
     lerf: the smallest softmax against any negative. margin: the cosine minus the largest cosine of a negative. auto:
-    contrast if the lift compared the scene with unrelated words, else lerf if there are negatives, else cosine."""
+    lerf if --negatives has prompts. Otherwise, contrast if the lift compared the scene with unrelated words, else lerf
+    if the text encoder has default negatives, else cosine. Encoders of plugins may have another default."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected. Larger values select fewer Gaussians. auto: a threshold from the
-    histogram of relevancies. None: the threshold of the encoder (0.7 for color), or else 0.5 for contrast and lerf,
-    0.02 for margin and auto for cosine. Unless a number is given, prompts that are probably not in the scene select
-    nothing."""
+    histogram of relevancies. None: 0.5 for contrast and lerf, 0.02 for margin, and auto for cosine. The encoder color
+    uses 0.7 for cosine, and encoders of plugins may set their own default. Unless you give a number, prompts that are
+    probably not in the scene select nothing."""
     min_reliability: float = 0.0
     """Minimum reliability of selected Gaussians, in 0..1. Larger values drop Gaussians that few views support."""
     refined: bool = True

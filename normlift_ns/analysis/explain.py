@@ -101,7 +101,7 @@ class Why:
     """Number of selected Gaussians."""
     changed: float
     """Share of the selected Gaussians whose direction the vote changed, in 0..1, estimated from at most 4,096 of them.
-    A direction counts as changed if it has a cosine below 0.98 to the direction before the vote."""
+    A direction counts as changed if its cosine with the direction before the vote is below 0.98."""
     norm: float
     c_intra: float
     c_inter: float
@@ -128,19 +128,19 @@ class Why:
         'The images agree (C_inter 0.97). Their weights are equivalent to 3.2 images of equal weight (N_eff).'
         """
         if len(self.views) == 0 and self.n_eff == 0:
-            return "No image shows the selection."
+            return "The selection is outside the regions of all images."
         if len(self.views) == 1:
-            return "Only one image shows the selection, so no other image can confirm its features."
+            return "Only one image shows the selection in its regions, so no other image can confirm its features."
         level = next(words for least, words in _LEVELS if self.c_inter >= least)
         count = "a single image" if self.n_eff < 1.05 else f"{self.n_eff:.1f} images of equal weight"
         return f"The images {level} (C_inter {self.c_inter:.2f}). Their weights are equivalent to {count} (N_eff)."
 
     @property
     def sentence(self) -> str:
-        """`words`, followed by a sentence about the share of the Gaussians that the vote changed, if there are any."""
+        """`words`, and a sentence about the share of directions that the vote changed, unless it is 0."""
         if self.changed == 0:
             return self.words
-        return f"{self.words} The vote of neighboring Gaussians changed {self.changed:.0%} of the answers."
+        return f"{self.words} The vote of neighboring Gaussians changed {self.changed:.0%} of the directions."
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields and the words as plain Python types."""
@@ -175,7 +175,7 @@ def explain_selection(
         source: Index of the Gaussian whose direction each Gaussian uses, from `refine`; None if each uses its own.
         beta, unlabeled: As in `lift`.
     Raises:
-        ValueError: Nothing is selected, or the numbers of Gaussians or regions differ.
+        ValueError: Nothing is selected, or the arguments have different numbers of Gaussians or regions.
     """
     n = evidence.num_gaussians
     if selected.dtype != torch.bool or selected.shape != (n,):
@@ -250,14 +250,16 @@ def _votes(joined: Evidence, table: Float64[Tensor, "r d"]) -> tuple[ViewVote, .
 
 
 _LINE_COLOR = (255, 176, 0)
-"""Orange, which contrasts with the dark rim for all types of color vision."""
+"""Orange, which contrasts with dark pixels for all types of color vision."""
 _OUTSIDE_BRIGHTNESS = 0.45
 _SIDE_PER_LINE_WIDTH = 320
 """Ratio of the longer image side to the line width."""
 
 
 def draw_outlines(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "r h w"]) -> UInt8[Tensor, "h w 3"]:
-    """Darken an image outside all masks, and draw an orange line with a dark rim along the inner edge of each mask.
+    """Darken an image outside all masks, and draw an orange line along the inner edge of each mask.
+
+    In images of 480 pixels or more, the line has a dark rim.
 
     >>> image = torch.full((9, 9, 3), 200, dtype=torch.uint8)
     >>> mask = torch.zeros(1, 9, 9, dtype=torch.bool)
@@ -322,14 +324,14 @@ class RecordedVotes:
         names = self.field.manifest.get("views_lifted")
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError(
-                "the run does not record the names of the lifted images; it is damaged or from an older version. Lift "
-                "again with: ns-normlift"
+                "the run does not list its lifted images, because it is damaged or from an older version; lift again "
+                "with: ns-normlift"
             )
         missing = [name for name in names if name not in set(self.scene.train.names)]
         if len(missing) > 0:
             raise InputError(
-                f"{len(missing)} of {len(names)} images of the lift, such as {missing[0]}, are no longer in the "
-                "dataset. Restore them, give the path of the dataset with --data, or lift again with: ns-normlift"
+                f"the dataset no longer has {len(missing)} of {len(names)} images of the lift, such as {missing[0]}. "
+                "Restore the images, give the path of the dataset with --data, or lift again with: ns-normlift"
             )
         store = self.field.store
         if isinstance(store, StoredEvidence) and store.evidence.num_views != len(names):

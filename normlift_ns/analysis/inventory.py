@@ -13,7 +13,7 @@ part. Each part joins the part with the largest affinity if that part is larger.
 least 0.95, then 0.9, and so on down to 0.5. The method corresponds to the ultrametric contour map of image segmentation
 (Arbelaez et al., "Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of
 edge strengths. Random borders of a segmentation differ between images, so the affinity across them is high. Borders of
-objects are the same in all images.
+objects are the same in all images, so the affinity across them is low.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from normlift_ns.options import OBJECT_MIN_GAUSSIANS, check_prompt_list
 MAX_OBJECTS = 20
 """Maximum number of objects in an inventory."""
 MIN_EVIDENCE = 0.001
-"""Minimum evidence of an object, as a fraction of the evidence of all images."""
+"""Minimum weight of an object, as a fraction of the weight of all Gaussians, both summed over all images."""
 _NEIGHBORS = 8
 _MIN_VISIBLE = 0.25
 """Minimum weight of a Gaussian in an image that shows it, as a fraction of its largest weight in any image."""
@@ -66,8 +66,8 @@ class Inventory:
     instance_id: Int32[Tensor, " n"]
     """Number of the object of every Gaussian, from 1; 0 for Gaussians without an object."""
     catalog: Catalogue
-    """Catalog of the objects. The text of an object is the best word of the vocabulary if the verdict on this word is
-    "found", else a number such as "object 3"."""
+    """Catalog of the objects. The text of an object is a word of the vocabulary, or a number such as "object 3"; see
+    `name_objects`."""
 
     def __len__(self) -> int:
         return len(self.catalog.objects)
@@ -79,7 +79,7 @@ class Inventory:
             ValueError: The inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
-            raise InputError(f"Object {number} is not in the inventory, which has objects 1 to {len(self)}.")
+            raise InputError(f"Object {number} does not exist. The objects are numbered from 1 to {len(self)}.")
         return self.instance_id == number
 
 
@@ -178,8 +178,8 @@ def find_inventory(
 ) -> Int32[Tensor, " n"]:
     """Find the main objects of a scene; return the object number of every Gaussian, 0 for none.
 
-    There are at most 20 objects, numbered from 1 by descending evidence. Each has at least 20 Gaussians, and at least a
-    thousandth of the evidence of all images.
+    There are at most 20 objects, numbered from 1 by descending weight over all images. Each has at least 20 Gaussians,
+    and at least a thousandth of the weight of all Gaussians.
 
     Args:
         features: One unit row per column (region) of the evidence.
@@ -313,7 +313,8 @@ def name_objects(
 ) -> tuple[str, ...]:
     """Return the name of every object, which is a word of the vocabulary or a number such as "object 3".
 
-    The word must be the best name, have the verdict "found", and select more than half of the object.
+    The word must be the best name and stand out from other words (see `best_words`). It must also have the verdict
+    "found", and select more than half of the object.
 
     Args:
         directions: Unit directions of the objects, from `mean_directions`.

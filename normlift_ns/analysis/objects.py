@@ -68,7 +68,7 @@ class OrientedBox:
 
 
 def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
-    """Return the oriented box of the central points.
+    """Return an oriented box around the central 98 % of the points along each of its axes.
 
     The axes are those of the smallest box (trimesh) around the points between the 1st and the 99th percentile along
     each of 13 directions. A few distant points therefore cannot rotate the box. Along each axis, the box extends from
@@ -206,6 +206,8 @@ def connected_components(
 ) -> Int32[Tensor, " n"]:
     """Label each selected Gaussian with its connected component, 0 for the largest; label other Gaussians -1.
 
+    Gaussians whose center is not finite count as not selected.
+
     Two selected Gaussians are connected if one is among the 8 nearest selected neighbors of the other, within `max_gap`
     times the median spacing. The spacing of a selected Gaussian is its distance to the nearest selected one at a
     different position. Components of equal size are ordered by their first Gaussian.
@@ -257,7 +259,8 @@ class Instances:
     def to_json(self) -> dict[str, Any]:
         """Return the prompt of each class, and the class, prompt and size of each object, as plain Python types.
 
-        Keys are ids. `none` is the id of Gaussians without a class or an object.
+        `class_id` and `instance_id` map each id to its prompt or object. `none` is the id of Gaussians without a class
+        or an object.
         """
         sizes = torch.bincount(self.instance_id.long(), minlength=len(self.classes) + 1).tolist()
         return {
@@ -340,7 +343,7 @@ It is relative to the largest such fraction over the images that show the object
 """
 MAX_BEST_VIEWS = 3
 _RENDER_SIZE = 256
-"""Longer side, in pixels, of the renders that rank images by object. A higher resolution does not change the order."""
+"""Longer side, in pixels, of the renders that rank images by object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,12 +395,12 @@ class CatalogueObject:
     views: int
     """Number of training images that show the object."""
     best_views: tuple[str, ...]
-    """Names of up to three images. Images of the whole object come first. Within each group, images that show it larger
-    come first."""
+    """Names of up to three images. Images of the whole object come before images of a part of it. In both groups,
+    images that show it larger come first."""
     capture: Placement
     """Position and size in the coordinates of the capture."""
     scene: Placement
-    """Position and size in the coordinates of the Gaussians, which nerfstudio and exported files use."""
+    """Position and size in the coordinates of the Gaussians, which viewers use."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,12 +33,14 @@ _Result = TypeVar("_Result")
 @renamed(json="output_json")
 @dataclass
 class NormLiftCheck(NormLift):
-    """Check a capture and this machine before a lift, with the options of ns-normlift. The command encodes a few images
-    to estimate the seconds of every stage, the memory and the disk space, but does not lift the scene. The exit code is
-    1 if a check finds an error."""
+    """Check a capture and this machine before a lift. The command accepts the options of ns-normlift. It encodes a few
+    images to estimate the time of every stage, the memory and the disk space, but does not lift the scene. The exit
+    code is 1 if a check finds an error."""
 
     output_json: Path | None = None
     """JSON file for the findings and the plan, in addition to the printed table."""
+    overwrite: bool = False
+    """Replace an existing JSON file of --output-json, and accept that the run directory of --timestamp exists."""
     dry_run: tyro.conf.Suppress[bool] = True
 
     def main(self) -> None:
@@ -104,7 +106,7 @@ class NormLiftCheck(NormLift):
     def _plan_opened(
         self, rows: list[Diagnostic], opened: OpenedCapture, source: FeatureSource, device: str
     ) -> Plan | None:
-        """Plan the lift, and add findings about its memory and its disk space."""
+        """Plan the lift, and add findings about its memory and its disk space; return None if the plan fails."""
         from normlift_ns import planning  # noqa: PLC0415
 
         plan = _try(rows, "plan", lambda: planning.plan_opened(opened, source, self.lift, device, self.num_devices))

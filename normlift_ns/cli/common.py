@@ -147,7 +147,7 @@ def apply_output_settings(terminal: OutputSettings, command: str) -> Iterator[No
     """Apply output settings to everything that runs in this context.
 
     Raises:
-        InputError: The log file cannot be written.
+        InputError: The log file cannot be written, or the path is not suitable for a log.
     """
     stdout, stderr = sys.stdout, sys.stderr
     with nullcontext() if terminal.log_file is None else _open_log(terminal.log_file) as log:

@@ -37,8 +37,8 @@ class NormLiftEval(CheckedOptions):
     """Paths to the config.yml files of lifted runs, one per scene."""
     protocol: Literal["scannet", "lerf", "masks", "none"] = "none"
     """Evaluation protocol. scannet: in 3D, with one Gaussian per labeled vertex. lerf: in 2D, with the polygons of
-    LERF-OVS. masks: in 3D and 2D, with instance masks of any capture. none: no ground truth and no scores, for --study
-    coverage and timing."""
+    LERF-OVS. masks: in 3D and 2D, with instance masks of any capture. none: no ground truth and no scores; needs
+    --study coverage or timing."""
     labels: tuple[Path, ...] = ()
     """Ground truth of each run, in the order of --load-config. scannet: a *_vh_clean_2.labels.ply file. lerf: a folder
     of JSON files. masks: a folder of instance masks. none: no ground truth."""
@@ -49,16 +49,16 @@ class NormLiftEval(CheckedOptions):
     refined: bool = True
     """Evaluate the directions after the vote. False: evaluate the directions before the vote."""
     study: tuple[Literal["ablation", "sweeps", "signals", "timing", "baselines", "coverage"], ...] = ()
-    """Additional studies, which load all runs into memory. ablation: scores of variants of the refinement, with and
-    without consensus. sweeps: scores for several values of each vote parameter, around the value of the run, and for
-    the default. signals: the share of Gaussians without evidence, accuracy by R and by norm, and a comparison of R with
-    opacity. timing: seconds of the lift and, on a GPU, of SFS's method (512 channels through gsplat). baselines:
-    accuracy of techniques from SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage:
-    regions without reliable evidence, unused images that would help, and new camera poses, as renders and as a camera
-    path."""
+    """Additional studies, which load all runs into memory. ablation: scores of variants of the vote, with and without
+    consensus. sweeps: scores for a fixed list of values of each of beta, k, sigma_d, tau, gamma and delta, and for
+    their defaults and the values of the run. signals: the share of Gaussians without evidence, accuracy by reliability
+    and by the norm of the mean feature, and a comparison of reliability with opacity. timing: seconds of the lift and,
+    on a GPU, of the method of SFS (Splat Feature Solver), which composites 512 channels with gsplat. baselines: scores
+    of techniques from SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage: regions
+    without reliable evidence, unused images that would help, and new camera poses, as renders and as a camera path."""
     compare: Literal["paper"] | None = None
     """Published results to compare with yours, in the printed tables and in the output file. paper: results of the
-    paper for --protocol scannet and lerf, and for the studies ablation, signals and timing."""
+    paper for --protocol scannet or lerf, and for the studies ablation, signals and timing."""
     text_embeddings: Path | None = None
     """NPZ file with one vector per class name, used instead of the text encoder of the runs."""
     data: Path | None = None
@@ -111,7 +111,7 @@ class NormLiftEval(CheckedOptions):
         return evaluation
 
     def _load(self, device: str, names: list[tuple[str, str]]) -> Iterator[EvaluatedRun]:
-        """Yield the runs, and add the name and the checkpoint of each to a list."""
+        """Yield the runs, and append the name and the checkpoint of each to `names`."""
         from normlift_ns.evaluation.protocols import EvaluatedRun  # noqa: PLC0415
         from normlift_ns.io.run_dir import cache_folder  # noqa: PLC0415
         from normlift_ns.lifted_run import open_run  # noqa: PLC0415 (--help should not wait for torch)

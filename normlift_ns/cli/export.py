@@ -39,18 +39,19 @@ class NormLiftExport(options.CheckedOptions):
     """Output folder. The command creates it if it is missing."""
     text: tuple[str, ...] = ()
     """Prompts to search for. Commas and semicolons separate prompts, except between double quotes. Without prompts, the
-    command uses the queries stored in the run, with their options."""
+    command uses the queries stored in the run, if there are any, with their options."""
     select: Literal["scene", "selection", "rest", "clean"] = "scene"
     """Gaussians to export. scene: all Gaussians. selection: Gaussians that any prompt selects. rest: Gaussians that no
-    prompt selects. clean: all except likely floaters, which are Gaussians floating in front of the cameras."""
+    prompt selects. clean: all except likely floaters, which float in front of the cameras instead of belonging to a
+    surface."""
     ask: options.AskOptions = field(default_factory=options.AskOptions)
     output_filename: str = "splat.ply"
-    """Name of the splat file. Its ending selects the format: .ply, .compressed.ply, .glb or .spz. The
-    command also writes <name>_rows.npy (index of each Gaussian in the run), <name>_names.json (names of class_id and
-    instance_id) and <name>_objects.json (objects)."""
+    """Name of the splat file. Its ending selects the format: .ply, .compressed.ply, .glb or .spz. The command also
+    writes <name>_rows.npy, the index of each Gaussian in the run. With prompts, it also writes <name>_names.json (names
+    of class_id and instance_id) and <name>_objects.json (objects)."""
     coordinates: Literal["scene", "capture"] = "scene"
     """Coordinate system of the exported Gaussians and objects. scene: that of the trained Gaussians and of viewers.
-    capture: that of the cameras before nerfstudio rotated and scaled them."""
+    capture: that of the original cameras, before the training rotated and scaled them."""
     masks_dir: Path | None = None
     """Folder for a PNG mask of each training image, with 255 for pixels of selected Gaussians, else 0. --select rest
     swaps the values. The masks fit the undistorted images that the scene was trained with."""
@@ -67,8 +68,8 @@ class NormLiftExport(options.CheckedOptions):
     """Maximum distance from a point to the center of its Gaussian for --transfer, > 0. Larger values label more points.
     The unit is the median distance from a Gaussian to the nearest one at another position."""
     transfer_coordinates: Literal["capture", "scene"] = "capture"
-    """Coordinate system of the cloud for --transfer. capture: that of the cameras before nerfstudio rotated and scaled
-    them. scene: that of the trained Gaussians."""
+    """Coordinate system of the cloud for --transfer. capture: that of the original cameras, before the training rotated
+    and scaled them. scene: that of the trained Gaussians."""
     object_max_gap: float = options.OBJECT_MAX_GAP
     """Maximum gap between Gaussians of one object, > 0, in units of the selection's median spacing. Larger values merge
     more objects."""

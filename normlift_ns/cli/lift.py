@@ -73,16 +73,17 @@ class NormLift(CheckedOptions):
     """Splat file to use instead of --load-config: PLY, compressed PLY, SPZ, .splat, GLB or glTF. Needs --colmap or
     --transforms."""
     load_gsplat: Path | None = None
-    """Checkpoint ckpt_<step>_rank0.pt of gsplat's simple_trainer, to use instead of --load-config. Needs --colmap."""
+    """Checkpoint ckpt_<step>_rank0.pt of gsplat's simple_trainer, to use instead of --load-config. Needs --colmap, or
+    --transforms with --gsplat-normalize False or a file in --world-transform."""
     splat: SplatOptions = field(default_factory=SplatOptions)
     add_images: Path | None = None
-    """COLMAP project folder or transforms.json with images taken after training, to lift in addition. It must also
-    contain training images, with the same cameras as in training."""
+    """COLMAP project folder or transforms.json with images taken after training, which the lift then uses too. To align
+    them, it must also contain two or more images of the scene, whose cameras have not moved relative to each other."""
     check_alignment: bool = True
     """Compare three training images with renders of the scene before the lift. False: skip the comparison."""
     dry_run: bool = False
-    """Estimate the seconds of every stage, the memory, the disk space and the number of cached views without lifting.
-    The command measures its speed on a few images."""
+    """Estimate the time of every stage, the memory, the disk space and the number of cached views, without lifting. The
+    command measures its speed on a few images."""
     data: Path | None = None
     """Current path of the dataset, if it was moved after training."""
     load_step: int | None = None
@@ -106,7 +107,7 @@ class NormLift(CheckedOptions):
     lift: LiftOptions = field(default_factory=LiftOptions)
 
     def main(self) -> LiftedRun | None:
-        """Lift, and return the new run; None for a dry run, or if another process writes the run."""
+        """Lift, and return the new run; None for a dry run, or if another process lifts or writes the run."""
         self.check_early()
         refuse_small_memory(loaded="torch" in sys.modules)
         if self.dry_run:
@@ -210,16 +211,17 @@ class NormLift(CheckedOptions):
         if len(paths) != 1:
             raise InputError(
                 f"Give one trained splat, got {len(paths)}: --load-config with the config.yml of a splatfacto run, "
-                "--load-ply with a PLY file, or --load-gsplat with a checkpoint of gsplat's trainer."
+                "--load-ply with a splat file such as PLY, or --load-gsplat with a checkpoint of gsplat's trainer."
             )
         default = SplatOptions()
         if self.load_config is None:
-            options, names, hint = self, ("data", "load_step"), "--load-config (for a splat, give --images)"
+            options, names, needed = self, ("data", "load_step"), "--load-config"
         else:
-            options, names, hint = self.splat, tuple(vars(default)), "--load-ply and --load-gsplat"
+            options, names, needed = self.splat, tuple(vars(default)), "--load-ply and --load-gsplat"
         for name in names:
             if getattr(options, name) != getattr(default, name, None):
-                raise InputError(f"--{name.replace('_', '-')} works only with {hint}. Leave it out.")
+                cure = "Give --images instead." if name == "data" else "Leave it out."
+                raise InputError(f"--{name.replace('_', '-')} works only with {needed}. {cure}")
 
     def new_run_location(self) -> tuple[str | None, Path | None]:
         """Return the capture name and output folder for `run_directory`; None if they are not known yet.
@@ -280,7 +282,7 @@ def progress_bars() -> Iterator[ProgressCallback]:
 
 
 def print_plan(plan: Plan) -> None:
-    """Print a table of the stages with their seconds and cached views, and a line about memory and disk space."""
+    """Print a table of the stages with their seconds and cached views, and lines about memory and disk space."""
     table = Table("stage", title=f"{plan.gaussians:,} Gaussians, {_views(plan.views)}, on {plan.device}")
     table.add_column("seconds", justify="right")
     table.add_column("cached")
@@ -289,10 +291,10 @@ def print_plan(plan: Plan) -> None:
     table.add_section()
     table.add_row("total", f"{plan.seconds:.1f}", f"estimated from {_views(plan.looked_at)}")
     common.CONSOLE.print(table)
-    gpu = "" if plan.device_bytes is None else f"{plan.device_bytes / 2**30:.2f} GiB on each GPU, "
+    gpu = "" if plan.device_bytes is None else f" and {plan.device_bytes / 2**30:.2f} GiB of GPU memory"
     subject = f"{plan.num_devices} processes share the work. Each" if plan.num_devices > 1 else "The lift"
-    space = f"{plan.host_bytes / 2**30:.2f} GiB of memory and {plan.disk_bytes / 2**30:.2f} GiB of disk"
-    common.info(f"{subject} needs about {gpu}{space}.")
+    common.info(f"{subject} needs about {plan.host_bytes / 2**30:.2f} GiB of memory{gpu}.")
+    common.info(f"The lift writes about {plan.disk_bytes / 2**30:.2f} GiB to the disk.")
 
 
 def keep_freed_memory() -> None:
@@ -322,7 +324,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     statistics = manifest["statistics"]
     storage = manifest["form"]
     table = Table.grid(Column(), Column(overflow="fold"), padding=(0, 2))
-    unseen = f"{statistics['zero_evidence_share']:.1%} are not visible in any image"
+    unseen = f"{statistics['zero_evidence_share']:.1%} are not visible in any image, or only outside all regions"
     table.add_row("Gaussians", f"{statistics['gaussians']:,}; {unseen}")
     if statistics["excluded"] > 0:
         table.add_row("not rendered", f"{statistics['excluded']:,} with non-finite or out-of-range parameters")
@@ -341,7 +343,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
         table.add_row("left-out views", describe_recognition(statistics["recognition"]))
     table.add_row("reliability R", describe_reliability(statistics["reliability_quantiles"]))
     if "refined_share" in statistics:
-        unsupported = f"{statistics['unsupported_share']:.1%} have no reliable neighbor"
+        unsupported = f"{statistics['unsupported_share']:.1%} have no direction and no neighbor with one"
         refined = f"{statistics['changed_share']:.1%} of the directions changed by more than 11 degrees"
         table.add_row("refined", f"{refined}; {unsupported}")
     seconds = {**before, **run.seconds}
@@ -371,17 +373,17 @@ def next_command(config: Path, queries: tuple[str, ...]) -> str:
 
 
 def describe_reliability(quantiles: dict[str, float]) -> str:
-    """Describe quantiles of the reliability in words.
+    """Describe quantiles of the reliability of the Gaussians with a direction.
 
     >>> describe_reliability({"0.05": 0.21, "0.5": 0.68, "0.95": 0.93})
-    'from 0 (views contradict each other) to 1 (all agree): half of the Gaussians above 0.68, 95% above 0.21'
+    'of the Gaussians with a direction, half are above 0.68 and 95% above 0.21; 1 means that many views agree'
     """
     values = {float(q): value for q, value in quantiles.items()}
     if not {0.05, 0.5} <= values.keys():
         return "no Gaussian has a direction"
     return (
-        "from 0 (views contradict each other) to 1 (all agree): "
-        f"half of the Gaussians above {values[0.5]:.2f}, 95% above {values[0.05]:.2f}"
+        f"of the Gaussians with a direction, half are above {values[0.5]:.2f} and 95% above {values[0.05]:.2f}; "
+        "1 means that many views agree"
     )
 
 
@@ -394,7 +396,7 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
         kind: Kind of regions, such as sam or superpixel.
 
     >>> describe_consensus(0.3, 0.4, "superpixel")
-    'regions of different views overlap by chance (agreement 0.30, at most 0.40), so features stay unchanged'
+    'agreement 0.30, which does not exceed the limit 0.40, so features stay unchanged'
     >>> describe_consensus(0.3, 0.4, "files").split("; ")[1]
     'if the regions are rough masks of objects, try --consensus-min-agreement 0'
     """
@@ -403,11 +405,8 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
     if agreement > least:
         extent = "applied" if agreement >= least + AGREEMENT_RAMP else "applied in part"
         return f"agreement {agreement:.2f}, {extent}"
-    unchanged = (
-        f"regions of different views overlap by chance (agreement {agreement:.2f}, at most {least:.2f}), so features "
-        "stay unchanged"
-    )
-    if kind in ("superpixel", "grid", "patches"):
+    unchanged = f"agreement {agreement:.2f}, which does not exceed the limit {least:.2f}, so features stay unchanged"
+    if kind in ("superpixel", "grid", "patches") or least == 0:
         return unchanged
     return f"{unchanged}; if the regions are rough masks of objects, try --consensus-min-agreement 0"
 

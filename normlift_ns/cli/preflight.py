@@ -24,12 +24,12 @@ from normlift_ns.options import (
 
 
 def check_readable_file(path: Path | None, flag: str) -> None:
-    """Raise FileNotFoundError if a path does not exist, or InputError if it is not a regular file."""
+    """Raise an error if a path does not exist, is not a regular file, or is not readable."""
     _check_readable(path, flag, "a file", "a file")
 
 
 def check_readable_folder(path: Path | None, flag: str) -> None:
-    """Raise FileNotFoundError if a path does not exist, or InputError if it is not a folder."""
+    """Raise an error if a path does not exist, is not a folder, or is not readable."""
     _check_readable(path, flag, "a folder", "the folder that contains the files")
 
 
@@ -139,7 +139,8 @@ def check_run_config(config: Path, data: Path | None, step: int | None = None, *
     if checkpoints.is_dir() and not any(checkpoints.glob(pattern)):
         files = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
         raise FileNotFoundError(
-            f"The checkpoint {pattern} is not in {checkpoints}, which contains {files}. Copy it to this folder."
+            f"The checkpoint {pattern} is not in {checkpoints}, which contains {files}. Copy it to this folder"
+            f"{'' if step is None else ', or leave out --load-step to use the last checkpoint'}."
         )
 
 
@@ -190,7 +191,7 @@ def refuse_unused(options: Any, names: Iterable[str], needed: str) -> None:
 
 
 def check_unused_options(lift: LiftOptions) -> None:
-    """Raise InputError for options that have no effect because their step is disabled."""
+    """Raise InputError for options that have no effect together with the other options."""
     if not lift.consensus:
         names = ("consensus_power", "consensus_sample", "consensus_min_agreement")
         refuse_unused(lift, names, "--consensus True")

@@ -77,8 +77,8 @@ class NormLiftQuery(CheckedOptions):
     history: bool = True
     """Keep a history of --interactive prompts in a file that only you can read."""
     coordinates: Literal["scene", "capture"] = "scene"
-    """Coordinate system of all positions in tables and --output-json. scene: that of the Gaussians, of exported files
-    and of viewers. capture: that of the cameras before nerfstudio rotated and scaled them."""
+    """Coordinate system of all positions in tables and --output-json. scene: that of the Gaussians and of viewers.
+    capture: that of the original cameras, before the training rotated and scaled them."""
     save_query: bool = False
     """Store the queries in the run in place of earlier ones. ns-render and ns-viewer then show their relevancy."""
     output_json: Path | None = None
@@ -91,12 +91,13 @@ class NormLiftQuery(CheckedOptions):
     """Names of the training images, such as 0001 0042, whose cameras render the scene. Without names, the command uses
     three evenly spaced images."""
     explain: bool = False
-    """List the images and regions that voted for the selection, and their agreement."""
+    """List the images that voted for the selection, with their weights, their agreement and the number of their
+    regions."""
     explain_dir: Path | None = None
     """Folder for the images of --explain, with outlines of the regions that voted."""
     segment: Literal["sam3"] | None = None
-    """Network that also segments some training views for the prompts. sam3: lift the masks of SAM 3, and print their
-    relevancy, their agreement between views and their reliability."""
+    """Also segment some training views for the prompts with this network, and lift its masks. A second table lists the
+    results, with the agreement between views. sam3: SAM 3. None: no segmentation."""
     segment_model: str | None = None
     """Weights of SAM 3: a folder in transformers format, or a model name to download. None: facebook/sam3."""
     segment_views: int = 8
@@ -104,24 +105,26 @@ class NormLiftQuery(CheckedOptions):
     reliable."""
     objects: bool = False
     """List the objects in the selection, which are connected groups of at least 20 Gaussians. The column id is the
-    instance_id in exports, and text is the prompt with the largest relevancy. centroid is the mean position, weighted
-    by evidence. box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z.
-    Both span the 1st to 99th percentile. R is the mean reliability. views counts the training images that show at least
-    a tenth as much of the object as the best image. best views names three images that show the object whole and large.
-    If there are more than 40 objects, the table counts them for each prompt and lists the 10 largest."""
+    instance_id in exports, and text is the prompt of the object. centroid is the mean position, weighted by evidence.
+    box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z. Both span the
+    1st to 99th percentile. R is the mean reliability. views counts the training images in which the visible area of the
+    object is at least a tenth of its largest. best views names up to three of them: those with the whole object first,
+    and larger views before smaller ones. If there are more than 40 objects, the table lists only the 10 largest, and a
+    line below counts the objects of each prompt."""
     objects_dir: Path | None = None
-    """Folder for the list of --objects in capture and scene coordinates, with the axes of the boxes. The files are
-    objects.json and objects.csv, and objects.ply and objects_scene.ply with the meshes of the boxes. docs/objects.md
-    explains every column."""
+    """Folder for the list of --objects or --inventory in capture and scene coordinates, with the axes of the boxes. The
+    files are objects.json and objects.csv, and objects.ply and objects_scene.ply with the meshes of the boxes.
+    docs/objects.md explains every column."""
     meters_per_unit: float | None = None
-    """Length of one capture unit in meters for --objects, > 0. If given, the table of objects is in meters, in the
-    coordinates of the capture."""
+    """Length of one capture unit in meters for --objects or --inventory, > 0. If given, the table of objects is in
+    meters, in the coordinates of the capture."""
     inventory: bool = False
-    """List at most 20 objects of the scene without prompts, by decreasing evidence, with the columns of --objects. Each
-    object is named after the matching word of the vocabulary, or else numbered, such as object 3."""
+    """List at most 20 objects of the scene without prompts, by decreasing evidence, with the columns of --objects. An
+    object is named after a word of the vocabulary that clearly matches it. Others get a number, such as object 3."""
     vocabulary: Path | None = None
-    """Text file with names of objects for --inventory, one per line. None: the words of the encoder, which are 1,000
-    classes for imagenet and the names of colors for color. With other encoders, objects are only numbered."""
+    """Text file with names of objects for --inventory, one per line. None: the texts of the run's file of text
+    embeddings, or else the words of the encoder: 1,000 classes for imagenet, and the names of colors for color. Other
+    encoders have no words, so objects are only numbered."""
     image: Path | None = None
     """PNG file for --inventory, with the outlines and numbers of the objects in the training image that shows the most
     objects."""
@@ -133,7 +136,7 @@ class NormLiftQuery(CheckedOptions):
     """Device for the text encoder and the renders: auto, cpu or cuda."""
 
     def main(self) -> list[dict[str, Any]]:
-        """Run the query, write files, print the table and return its rows; none with --stdin or --interactive."""
+        """Run the query, write files, print the table and return its rows; [] with --stdin or --interactive."""
         self._check()
         common.info_opening(self.load_config)
         if self.render_dir is not None:  # torch loads while the run answers without it
@@ -181,7 +184,7 @@ class NormLiftQuery(CheckedOptions):
         return rows
 
     def _open(self) -> QuickRun:
-        """Open the run; load its scene only if the files of the run lack the Gaussian centers."""
+        """Open the run; load its scene only if the files of the run do not determine the Gaussian centers."""
         from normlift_ns.query.arrays import open_quick  # noqa: PLC0415 (as above)
 
         if self.device.startswith("cuda"):
@@ -388,7 +391,7 @@ class NormLiftQuery(CheckedOptions):
             (("render_views",), self.render_dir, "--render-dir FOLDER"),
             (("explain_dir",), self.explain, "--explain True"),
             (("segment_model", "segment_views"), self.segment, "--segment sam3"),
-            (("objects_dir", "meters_per_unit"), self.objects or self.inventory, "--objects True"),
+            (("objects_dir", "meters_per_unit"), self.objects or self.inventory, "--objects True or --inventory True"),
             (("vocabulary", "image"), self.inventory, "--inventory True"),
             (("history",), self.interactive, "--interactive True"),
         ):
@@ -539,9 +542,9 @@ def print_answer(
         if row["read_as"] is not None:
             common.info(f'{row["text"]}: read as "{row["read_as"]}"; the encoder ignores the other words.')
         if row["verdict"] in ("weak match", "probably not here"):
-            position = "" if row["nearest"] is None else f" at {common.format_number(row['nearest'])}"
+            position = "" if row["nearest"] is None else f", near {common.format_number(row['nearest'])}"
             peak = common.format_number(row["peak"])
-            common.info(f"{row['text']}: {row['verdict']}. The nearest match{position} has relevancy {peak}.")
+            common.info(f"{row['text']}: {row['verdict']}. The largest relevancy is {peak}{position}.")
 
 
 def answer_table(
@@ -606,16 +609,16 @@ def print_catalog(catalog: Catalogue, coordinates: Literal["scene", "capture"] =
     common.CONSOLE.print(_catalog_table(catalog, sorted(largest, key=lambda item: item.id), coordinates))
     if count > _MAX_ROWS:
         parts = [
-            f"{text or 'selection'}: {len(sizes):,} objects, {sum(sizes):,} Gaussians"
+            f"{text or 'selection'}: {len(sizes):,} object{'s' * (len(sizes) != 1)}, {sum(sizes):,} Gaussians"
             for text in dict.fromkeys(item.text for item in catalog.objects)
             for sizes in [[item.gaussians for item in catalog.objects if item.text == text]]
         ]
         common.info(
-            f"{'; '.join(parts)}. {count - _LARGEST:,} smaller objects are not shown; write all with "
+            f"{'; '.join(parts)}. The table lists only the {_LARGEST} largest objects; write all with "
             "--objects-dir FOLDER."
         )
     if catalog.num_in_small_components > 0:
-        common.info(f"{catalog.num_in_small_components:,} selected Gaussians are in groups too small to be listed.")
+        common.info(f"Selected Gaussians in groups too small to be listed: {catalog.num_in_small_components:,}.")
 
 
 def _catalog_table(
@@ -649,7 +652,7 @@ def _catalog_table(
 
 
 IMAGES_PER_GROUP = 3
-"""Number of images per prompt in each of two groups: images with the largest weights, and images that disagree most."""
+"""Maximum number of images per prompt in each of two groups: the largest weights, and the largest disagreements."""
 _LARGEST_WEIGHT = "weighs most"
 
 
@@ -693,7 +696,7 @@ def save_vote_images(
 
 
 def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None]) -> None:
-    """Print a table of images, and a sentence about their agreement for each prompt."""
+    """Print a table of images, and for each prompt a sentence about their agreement."""
     result = explanation_table(names, texts, reasons, narrow=common.CONSOLE.width < 120)
     if result.row_count > 0:
         common.CONSOLE.print(result)

@@ -20,8 +20,8 @@ from normlift_ns.errors import InputError
 @dataclass
 class NormLiftServe(ServeOptions):
     """Serve lifted runs to programs, browsers and agents. The server has an HTTP API (its client is
-    `normlift_ns.connect`), the page of ns-normlift-view, and tools for agents. Runs stay open, so queries take only
-    milliseconds.
+    `normlift_ns.connect`), the page of ns-normlift-view and, with --mcp True, tools for agents. Runs stay open while
+    memory permits, so queries do not load them again.
     """
 
     runs: Annotated[
@@ -29,8 +29,9 @@ class NormLiftServe(ServeOptions):
     ]
     """Paths to the config.yml files of lifted runs."""
     mcp: bool = False
-    """Also serve tools of the Model Context Protocol at /mcp. If standard input is a pipe, as when an agent starts this
-    command, serve them on standard input and output instead. Needs pip install 'normlift-ns[mcp]'."""
+    """Also serve tools of the Model Context Protocol, at /mcp. If standard input is a pipe, as when an agent starts
+    this command, serve only these tools, on standard input and output, without the page and the HTTP API. Needs pip
+    install 'normlift-ns[mcp]'."""
     export_dir: Path | None = None
     """Folder in which the tools of --mcp may write files. None: the tools write no files."""
 

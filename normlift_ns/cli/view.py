@@ -35,8 +35,8 @@ class ServeOptions(CheckedOptions):
     read_only: bool = False
     """Prevent visitors from storing prompts in the run."""
     max_gaussians: int = 1_000_000
-    """Maximum number of Gaussians to render. Larger scenes show only their most opaque and largest Gaussians. Larger
-    values need more browser memory."""
+    """Maximum number of Gaussians that a browser renders. Larger scenes show only their most opaque and largest
+    Gaussians. Larger values need more browser memory."""
     device: str = "auto"
     """Device for the text encoder: auto, cpu or cuda."""
 
@@ -61,9 +61,9 @@ class ServeOptions(CheckedOptions):
         return open_run(config, device=self.device)
 
     def announce(self, server: WarmServer, port: int, what: str) -> None:
-        """Print the address of a server, in a sentence that begins with `what`."""
+        """Print the address of a server, in a sentence that begins with `what`, and remarks about port and access."""
         if port != self.port:
-            info(f"Port {self.port} is already in use.")
+            info(f"Port {self.port} is not available.")
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
         host = f"[{host}]" if ":" in host else host
         info(f"{what} is at http://{host}:{port} (press Ctrl-C to stop it)")

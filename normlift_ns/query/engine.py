@@ -45,7 +45,7 @@ _CENTRAL = (0.05, 0.95)
 _SUMMARIZED = ("reliability", "weight")
 """Scalars per Gaussian from which the summary of a prompt is computed."""
 _THREADS = min(8, os.cpu_count() or 1)
-"""Number of prompts that are summarized concurrently."""
+"""Maximum number of prompts that are summarized concurrently."""
 
 
 class QueryField(HasManifest, Protocol):
@@ -226,7 +226,7 @@ class Finding:
 
     @property
     def peak(self) -> float | None:
-        """Highest relevancy of a Gaussian that has a direction."""
+        """Highest relevancy of a Gaussian that has a direction; None if no Gaussian has one."""
         valid = self.answer.valid
         return float(self.relevancy[valid].max()) if bool(valid.any()) else None
 
@@ -246,14 +246,14 @@ class Finding:
     def verdict(self) -> Verdict | None:
         """Presence of the prompt in the scene; None if there is nothing to compare its cosines with.
 
-        The verdict on a prompt that selects Gaussians is weak match or found.
+        For a prompt that selects Gaussians, a weak match replaces "probably not here".
         """
         verdict = self.answer.verdicts[self.index]
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
 
     @property
     def read_as(self) -> str | None:
-        """Words of the prompt that the encoder uses; None if it uses all words except articles, or none."""
+        """Words of the prompt that the encoder uses; None if it ignores at most articles, or all words."""
         kind = find_encoder_kind(encoder_name(self.answer.field))
         known = "" if kind is None else kind.known_words(self.text)
         ignored = set(re.findall(r"\w+", self.text.lower())) - set(re.findall(r"\w+", known.lower()))
@@ -263,7 +263,8 @@ class Finding:
     def nearest(self) -> list[float] | None:
         """Position that is most similar to the prompt, even if no Gaussian is selected there.
 
-        It is the weighted mean center of the 0.1 % of the Gaussians that have the highest relevancy.
+        It is the weighted mean center of the 0.1 % of the Gaussians that have the highest relevancy. It is None if no
+        Gaussian has a direction.
         """
         if self.histogram is None:
             return None
@@ -278,7 +279,7 @@ class Finding:
 
     @property
     def objects(self) -> list[SceneObject]:
-        """Objects of the selection, which are its connected components, by descending size."""
+        """Objects of the selection, its connected components of at least 20 Gaussians, by descending size."""
         from normlift_ns.analysis.objects import find_objects  # noqa: PLC0415 (needs torch)
 
         return find_objects(self.answer.field, self.answer.means, self.mask).objects

@@ -117,7 +117,8 @@ def make_query(
         field: Field to query.
         encode: Function that returns one embedding per text, from an encoder that fits the field.
         texts: Prompts.
-        negatives: Negative prompts (default: those of the encoder, see `default_rule`).
+        negatives: Negative prompts. If None, use those of `default_rule`, or else `CANONICAL_NEGATIVES` if the rule
+            needs negatives.
         relevancy: Relevancy rule. "auto" is the rule of `default_rule` if `negatives` is None, cosine if `negatives` is
             empty, and lerf otherwise.
         threshold: Relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests. If
@@ -193,7 +194,7 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
 
 
 QUERIES_FILE = "queries.safetensors"
-"""Name of the file in the folder of the field. It has the embeddings as tensors, and everything else as metadata."""
+"""Name of the file of a stored query in the folder of the field. Embeddings are tensors; the rest is metadata."""
 _METADATA_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
 _REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save-query True"
 
@@ -274,7 +275,10 @@ def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
     if not math.isfinite(metadata.threshold):
         raise InputError(f"the threshold is {metadata.threshold}, expected a finite number")
     if not {"vectors"} <= set(arrays) <= set(_VECTORS):
-        raise InputError(f"it contains {', '.join(sorted(arrays)) or 'nothing'}; expected {' and '.join(_VECTORS)}")
+        raise InputError(
+            f"it contains {', '.join(sorted(arrays)) or 'nothing'}; expected {_VECTORS[0]}, with or without "
+            f"{_VECTORS[1]}"
+        )
     negative = arrays.get("negative_vectors")
     if (negative is None) != (len(metadata.negatives) == 0):
         raise InputError(

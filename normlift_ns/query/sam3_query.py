@@ -1,7 +1,7 @@
-"""Lift SAM 3 masks, with two regions per prompt and view: inside and outside the mask.
+"""Lift of SAM 3 masks, with two regions per prompt and view: inside and outside the mask.
 
-The relevancy of a Gaussian for a prompt is the fraction of its weight inside the masks of the voting views,
-sum_v E_in / sum_v (E_in + E_out). The weights are those of the rasterizer that trained the scene.
+The relevancy of a Gaussian for a prompt is the fraction of its weight inside the masks of the voting views, sum_v E_in
+/ sum_v (E_in + E_out). The weights are those of the rasterizer that trained the scene.
 
 The mask of a whole view can be wrong, because SAM 3 misses an object or confuses it with another one. Two rounds
 therefore determine the voting views. In the first round, all views in which SAM 3 found the prompt vote. In the second

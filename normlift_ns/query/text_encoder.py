@@ -100,8 +100,9 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
         device: Device of the network, as in `choose_device`; "auto" runs the text tower of OpenCLIP on the CPU.
         cache: Folder for a cache of embeddings; None for no cache.
     Raises:
-        ValueError: The encoder is unknown, or its weights or the text embeddings are not those of the lift.
-        FileNotFoundError: The weights or text embeddings no longer exist.
+        ValueError: The encoder is not available, or a weight file or the text embeddings are not those of the lift. A
+            network is compared with that of the lift when it encodes its first prompt.
+        FileNotFoundError: A weight file of the lift or the file of text embeddings no longer exists.
     """
     options = _options(field)
     if options.text_embeddings is not None:
@@ -118,9 +119,10 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
     try:
         kind = encoder_kind(options.encoder)
     except InputError as error:
+        problem = str(error).partition(";")[0]  # the rest suggests another encoder, which a lifted run cannot use
         raise InputError(
-            f"The encoder of this run is not available: {error}. Install its package, or give a file of text vectors "
-            "from that encoder with --text-embeddings."
+            f"The encoder of this run is not available: {problem}. Install or repair its package, or give a file of "
+            "text vectors from that encoder with --text-embeddings."
         ) from None
     recorded = _identity(field.manifest.get("features"))
     if kind.texts is not None:
@@ -181,8 +183,8 @@ def _check_vectors(path: Path, expected: object) -> None:
         raise FileNotFoundError(f"the run's file of text vectors {path} does not exist; {remedy}")
     if isinstance(expected, str) and (actual := TextEmbeddingFile(path).identity["content"]) != expected:
         raise InputError(
-            f"{path} is not the file that the lift used, so results would differ. Its content is {actual}, expected "
-            f"{expected}. {remedy[0].upper()}{remedy[1:]}"
+            f"{path} is not the file that the lift used, so results would differ. The digest of its content is "
+            f"{actual}, expected {expected}. {remedy[0].upper()}{remedy[1:]}"
         )
 
 

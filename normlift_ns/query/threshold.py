@@ -21,8 +21,8 @@ from normlift_ns.options import RelevancyRule
 from normlift_ns.query.text_encoder import HasManifest, encoder_name
 
 Verdict = Literal["found", "weak match", "probably not here"]
-"""Presence of a prompt in a scene. found: the prompt matches better than almost all unrelated words.
-weak match: it matches better than most of them. probably not here: it does not."""
+"""Presence of a prompt in a scene; see `judge`. With null words, found: the prompt matches better than 90 % of them.
+weak match: it matches better than 70 % of them. probably not here: it does not."""
 
 
 # Histogram of the relevancies of one prompt, with a suggested threshold.
@@ -71,6 +71,7 @@ class Histogram:
     threshold: float
     """Relevancy above which a Gaussian is selected."""
     median: float
+    """Median relevancy; the smallest one if more than half of the Gaussians are at the top."""
     top: float
     """Relevancy that one Gaussian in a thousand exceeds."""
     suggested: float

@@ -82,7 +82,7 @@ class ServerOptions:
     allowed_hosts: tuple[str, ...] = ()
     read_only: bool = False
     access_token: str = field(default_factory=lambda: secrets.token_urlsafe(18))
-    """Token for requests that write into a run; not required if the server listens on localhost only."""
+    """Token for MCP, and for requests that write into a run; not required if the server listens on localhost only."""
 
     @property
     def is_local(self) -> bool:
@@ -309,7 +309,8 @@ class WarmServer:
         return self.options.may_write(access)
 
     def offer(self, name: str, content: bytes) -> str:
-        """Store a file for download, and return its URL path; delete the oldest files if there are too many."""
+        """Store a file for download, and return its URL path; delete the oldest files above limits of number and
+        size."""
         key = secrets.token_urlsafe(16)
         self._downloads[key] = name, content
         while len(self._downloads) > 1 and (
@@ -403,7 +404,8 @@ class WarmServer:
             return None if ended else await _close(websocket, error)
 
     def start(self, extra_routes: Sequence[Any] = (), lifespan: Any = None) -> int:
-        """Start the server in a thread, and return its port: `options.port` or, if it is in use, the next free one."""
+        """Start the server in a thread, and return its port: `options.port` or, if it is not available, the next
+        one."""
         listener = _bind(self.options.host, self.options.port)
         config = uvicorn.Config(
             self.app(extra_routes, lifespan), log_config=None, log_level="error", access_log=False, server_header=False,
@@ -451,7 +453,7 @@ def _bind(host: str, port: int) -> socket.socket:
             listener.close()
         else:
             return listener
-    raise InputError(f"--port {port} and the 99 ports after it are in use. Choose another port.")
+    raise InputError(f"--port {port} and the ports after it are not available. Give another port.")
 
 
 async def _no_icon(request: Request) -> Response:

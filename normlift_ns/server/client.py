@@ -189,7 +189,10 @@ class RemoteRun:
 
     @check_arguments
     def catalogue(self, part: RemoteAnswer | RemoteFinding) -> dict[str, Any]:
-        """List the objects that the prompts select, with oriented boxes, as JSON types."""
+        """List the objects that the prompts of an answer select, with oriented boxes, as JSON types.
+
+        A finding stands for all prompts of its answer.
+        """
         return json.loads(self._post("catalog", _selection(part).question))
 
     def inventory(self) -> dict[str, Any]:
@@ -226,7 +229,13 @@ class RemoteRun:
     def render(
         self, view: str | int | Camera = 0, found: Part | None = None, *, max_size: int = 2048
     ) -> UInt8[Tensor, "h w 3"]:
-        """Render the scene from a camera, with the selection `found` in color and everything else in gray."""
+        """Render the scene from a camera. If `found` is given, only this selection is in color.
+
+        Args:
+            view: Camera, or the name or index of a training image.
+            found: Selection to color (default: trained colors of all Gaussians).
+            max_size: Maximum longer side of the image in pixels, in 16..2048.
+        """
         request: dict[str, Any] = {"max_size": max_size}
         if isinstance(view, Camera):
             size = {"width": view.width, "height": view.height}
@@ -271,7 +280,7 @@ class RemoteRun:
     def save(self, answer: RemoteAnswer, *, replace: bool = True) -> str:
         """Store the prompts of an answer in the run, and return the number of stored prompts as text.
 
-        This needs the access token unless the server listens on localhost only.
+        This needs the access token unless the server listens on localhost only. A read-only server rejects it.
 
         Args:
             replace: Replace the prompts that the run already stores, instead of adding new ones to them.

@@ -30,10 +30,7 @@ _MAX_IMAGES = 3
 _MIN_DISAGREEMENT = 0.1
 """Minimum disagreement of the images that an explanation shows as disagreeing."""
 _IMAGE_SIZE = 480
-_OVER_VIEWS, _CHANGED = (
-    "Based on about {:.0f} images{}.",
-    "; the vote of neighboring Gaussians changed {:.0%} of the answers",
-)
+_CHANGED = "; the vote of neighboring Gaussians changed {:.0%} of the directions"
 
 
 def region_mask(served: ServedRun, state: State, value: protocol.Region | protocol.Brush) -> Bool[Tensor, " n"]:
@@ -179,11 +176,11 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
         facts = {"share": vote.share, "agreement": vote.agreement, "disagreement": vote.disagreement}
         return {"name": votes.names[vote.view], "url": images.get(vote.view), "regions": len(vote.regions), **facts}
 
-    changed = _CHANGED.format(why.changed) if why.changed > 0 else ""
+    changed, count = _CHANGED.format(why.changed) if why.changed > 0 else "", max(1, round(why.n_eff))
     facts = {"agreement": why.c_inter, "effective_views": why.n_eff, "problem": problem}
     facts |= {"name": state.name, "selected": why.gaussians}
     votes_of = {name: [entry(vote) for vote in group] for name, group in groups.items()}
-    return {"text": _OVER_VIEWS.format(max(1.0, why.n_eff), changed), **facts, **votes_of}
+    return {"text": f"Based on about {count} image{'s' * (count > 1)}{changed}.", **facts, **votes_of}
 
 
 def _plain_images(served: ServedRun, votes: Sequence[ViewVote]) -> dict[int, str]:

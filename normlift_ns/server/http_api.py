@@ -30,6 +30,10 @@ MAX_FEATURES = 2**17
 """Maximum number of Gaussians in one request for features."""
 T = TypeVar("T")
 _BINARY = "application/octet-stream"
+_MAY_NOT_WRITE = (
+    "This request may not write into the run: the server is read-only, or the header Authorization: Bearer TOKEN lacks "
+    "the access token"
+)
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ def explain(served: ServedRun, selection: schema.Selection) -> schema.ExplainRes
 
 
 def export(served: ServedRun, request: schema.ExportRequest) -> Content:
-    """Return a file of a selection, or of the whole scene if the request selects nothing."""
+    """Return a file of a selection, or of the whole scene if the request has only a format."""
     state = schema.select_state(served, request)
     whole = request == schema.ExportRequest(format=request.format)
     mask = ~served.space.empty_mask() if whole else state.selection
@@ -235,7 +239,7 @@ def api_routes(server: Server) -> list[Route]:
     def route(endpoint: Endpoint) -> Route:
         async def handle(request: Request) -> Response:
             if endpoint.writes and not server.may_write(_access(request)):
-                return _json({"error": "Writing needs the access token in the header Authorization: Bearer TOKEN"}, 403)
+                return _json({"error": _MAY_NOT_WRITE}, 403)
             value = request.query_params if endpoint.request is None else decode(await request.body(), endpoint.request)
             served = await server.run_of(request.path_params["run"])
             result = await server.in_thread(lambda: endpoint.work(served, value), slow=endpoint.slow)

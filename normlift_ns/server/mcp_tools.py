@@ -61,17 +61,17 @@ class Tools:
 
     def find(self, run: Run, prompts: Prompts) -> str:
         """Search a scene for prompts. The result for each prompt has a verdict (found, weak match, probably not here),
-        and the number of selected Gaussians with their position and size. It also has the highest relevancy (0..1) and
-        the position of the nearest match."""
+        and the number of selected Gaussians with their position and size. It also has the highest relevancy and the
+        position of the best match."""
         rows = msgspec.to_builtins(schema.answered(self._run(run), _question(prompts))[1])
         for row in rows["results"]:
             row.pop("histogram")
         return _text(rows)
 
     def list_objects(self, run: Run, prompts: Prompts) -> str:
-        """List and count the separate objects that match prompts, the largest first. Each object has a number, a box
-        (min and max corner), a center, a number of Gaussians and the strength of its evidence. Without prompts, list
-        the main objects of the scene, which takes up to a minute."""
+        """List and count the separate objects that match each prompt, the largest first. Each object has a number, a
+        box (min and max corner), a center, a number of Gaussians and the strength of its evidence. Without prompts,
+        list the main objects of the scene, which takes up to a minute."""
         if len(prompts) == 0:
             return _text(self.inventory(run))
         return _text(schema.objects_result(schema.select_state(self._run(run), _selection(prompts, None))))
@@ -152,7 +152,7 @@ def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
     """Return an MCP server for the runs of a server.
 
     Args:
-        export_dir: Folder that the tool export writes to; None to omit this tool.
+        export_dir: Folder that the tool export writes to; None to omit this tool. A read-only server omits it too.
     """
     mcp = MCPServer("normlift", instructions=_INSTRUCTIONS, version=normlift_ns.__version__, log_level="ERROR")
     tools = Tools(server, export_dir)

@@ -18,7 +18,7 @@ from normlift_ns.query.question import join_prompts
 from normlift_ns.session.state import State
 
 MAX_LINK_LENGTH = 6000
-"""Maximum number of characters in a link; web servers reject request lines longer than 8 KB."""
+"""Maximum number of characters in a link; many web servers reject request lines longer than 8 KB."""
 Finite = Annotated[float, msgspec.Meta(ge=-1e30, le=1e30)]
 Vector = tuple[Finite, Finite, Finite]
 Side = Annotated[int, msgspec.Meta(ge=1, le=16384)]

@@ -103,7 +103,7 @@ class ServedRun:
 
     @cached_property
     def space(self) -> SelectionContext:
-        """Field of the run with the centers of its Gaussians."""
+        """Semantic field of the run, with the centers of the Gaussians."""
         return SelectionContext(self.run.field, self.run.scene.gaussians.means.detach())
 
     @cached_property
@@ -255,8 +255,8 @@ class ServedRun:
         """Return the name and content of a file of Gaussians, and a message for the user; see `selection_bytes`."""
         file, content = selection_bytes(self.run.scene, self.run.field, state, mask, name, kind)
         faint = int((mask & ~self.visible).sum())
-        note = f" It also has {faint:,} Gaussians that are too faint to see (opacity below 1/255)." if faint > 0 else ""
-        return file, content, f"Downloaded {file} with {int(mask.sum()) - faint:,} Gaussians.{note}"
+        note = f" Left out, because they are too faint to see (opacity below 1/255): {faint:,}." if faint > 0 else ""
+        return file, content, f"Downloaded {file}. Gaussians: {int(mask.sum()) - faint:,}.{note}"
 
     def cached(self, key: bytes, compute: Callable[[], T], size: Callable[[T], int] = lambda result: 0) -> T:
         """Return the cached result for a key, and compute it if necessary; the most recently used results are kept.

@@ -45,8 +45,6 @@ _SPOT = 0.3
 """Extent of the region around a position to look at, as a multiple of the scene's radius."""
 _SLIDERS = ("threshold", "reliability", "grow")
 """Actions of sliders. Only the last waiting one is applied, and successive ones are merged in the history."""
-_LATEST = ("hover", "still", "camera")
-"""Actions that do not wait for other actions; each replaces a waiting one of the same name."""
 
 T = TypeVar("T")
 
@@ -410,8 +408,8 @@ class PageSession:
     async def _save(self, pending: _Pending) -> None:
         if self._read_only:
             raise InputError(
-                "This page may not store prompts in the run. Start the server without --read-only. On another machine, "
-                "open the address with the access token that the server prints."
+                "This page may not store prompts in the run. Start the server without --read-only, or open the address "
+                "with the access token that the server prints."
             )
         replaces = pending.value is not None and pending.value.replace
         store = partial(self._run.save, self._state.query, replaces=replaces)

@@ -32,15 +32,15 @@ class PromptDiagnostics:
     histogram: Histogram
     """Histogram of the relevancies of the prompt."""
     warning: str
-    """Warning about the prompt, or an empty string. If the encoder ignores some words, the warning lists those that it
-    uses. If the verdict is "weak match" or "probably not here", or no Gaussian is selected, it describes the nearest
-    match."""
+    """Warning about the prompt; empty if there is none, and for clicks. If the encoder ignores some words, the warning
+    lists those that it uses. If the verdict is "weak match" or "probably not here", or no Gaussian is selected, the
+    warning has the largest relevancy and its position."""
     nearest_position: tuple[float, float, float] | None = None
-    """Position of the nearest match, if there is a warning."""
+    """Position of the largest relevancy, if there is a warning; see `Finding.nearest`."""
 
 
 def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagnostics, ...]:
-    """Return diagnostics of the first `max_prompts` prompts of the query, or () for a selection made by hand."""
+    """Return diagnostics of up to `max_prompts` prompts that select Gaussians; () if no prompt selects."""
     answer = state.answer
     if answer is None or not state.prompts_select:
         return ()
@@ -60,16 +60,15 @@ def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagn
 def _warning(finding: Finding) -> str:
     if is_click(finding.text):
         return ""
-    position = "" if finding.nearest is None else f" at {' '.join(f'{x:.2f}' for x in finding.nearest)}"
+    position = "" if finding.nearest is None else f", near {' '.join(f'{x:.2f}' for x in finding.nearest)}"
     read_as = "" if finding.read_as is None else f'{finding.text}: read as "{finding.read_as}". '
     if finding.verdict in ("weak match", "probably not here"):
-        verdict = f"{finding.text}: {finding.verdict}. The nearest match{position} has relevancy {finding.peak:.2f}."
-        return read_as + verdict
+        return read_as + f"{finding.text}: {finding.verdict}. The largest relevancy is {finding.peak:.2f}{position}."
     if finding.peak is None or bool(finding.mask.any()):
         return read_as.strip()
     return read_as + (
         f"{finding.text}: no Gaussian is above the threshold of {finding.answer.question.threshold:.2f}. "
-        f"The nearest match{position} has relevancy {finding.peak:.2f}. Lower the threshold, or press Use suggested."
+        f"The largest relevancy is {finding.peak:.2f}{position}. Lower the threshold, or press Use suggested."
     )
 
 
@@ -109,7 +108,8 @@ def _only_clicks(question: Query) -> bool:
 
 
 ClickMode = Literal["select", "add", "remove"]
-"""Effect of a click: select the object at the clicked position, add it to the selection, or remove it from there."""
+"""Effect of a click on the clicked object: select only this object, add it to the selection, or remove it from the
+selection."""
 MAX_LAYERS = 32
 MAX_GROW_STEPS = 10
 """Maximum number of steps for growing or shrinking a selection."""
@@ -375,8 +375,12 @@ def add_layer(state: State, name: str) -> State:
     """
     name = clip_text(name, 60)
     layers = tuple(layer for layer in state.layers if layer.name != name)
-    if name == "" or len(layers) >= MAX_LAYERS or not bool(state.selection.any()):
-        raise InputError(f"A layer needs a name and a selection, and the maximum number of layers is {MAX_LAYERS}.")
+    if name == "":
+        raise InputError("The layer has no name. Type a name.")
+    if not bool(state.selection.any()):
+        raise InputError("Nothing is selected. First select the Gaussians of the layer.")
+    if len(layers) >= MAX_LAYERS:
+        raise InputError(f"The maximum number of layers is {MAX_LAYERS}. First remove a layer.")
     return replace(state, layers=(*layers, Layer(name, state.selection)), action=f"Save layer {name}")
 
 

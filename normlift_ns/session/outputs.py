@@ -31,8 +31,10 @@ def store_query(folder: Path | None, query: Query | None, *, replaces: bool = Fa
     Raises:
         ValueError: The query or the folder is missing, or `merge_queries` cannot merge the queries.
     """
-    if query is None or folder is None:
+    if query is None:
         raise InputError("This session has no query yet, so it has no prompts to save. Type a prompt and press Ask.")
+    if folder is None:
+        raise InputError("The run is not stored yet, so it cannot store prompts. Save the prompts after the training.")
     merged = merge_queries(None if replaces else load_query(folder), query)
     save_query(folder, merged)
     return "one prompt" if len(merged.texts) == 1 else f"{len(merged.texts)} prompts"
@@ -53,7 +55,7 @@ def splat_bytes(splat: TrainedSplat, state: State, mask: Bool[Tensor, " n"], nam
 def selection_bytes(
     scene: Scene, field: SemanticField, state: State, mask: Bool[Tensor, " n"], name: str, kind: str = "ply"
 ) -> tuple[str, bytes]:
-    """Return the name and content of a file of the Gaussians in `mask`.
+    """Return the name and content of a file of the Gaussians in `mask`, or of their image masks.
 
     Args:
         name: Name of the selection.

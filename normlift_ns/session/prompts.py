@@ -160,15 +160,14 @@ def merge_queries(stored: Query | None, asked: Query) -> Query:
         stored: Query stored in the run; None if it has none.
         asked: Query to add.
     Raises:
-        ValueError: The queries differ in rule, negatives or features.
+        ValueError: The queries differ in rule, negatives or refinement.
     """
     if stored is None:
         return asked
     if (stored.rule, stored.negatives, stored.refined) != (asked.rule, asked.negatives, asked.refined):
         raise InputError(
-            f"The {len(stored.texts)} prompts stored in the run use the rule {stored.rule}. The new prompts use the "
-            f"rule {asked.rule}, other negatives or other features, and cannot be added to them. Replace the stored "
-            "prompts, or ask again with the same settings."
+            f"The new prompts cannot be added to the stored ones, because they differ in rule ({asked.rule} and "
+            f"{stored.rule}), negatives or refinement. Replace the stored prompts, or ask again with the same settings."
         )
     rows = {text: row for query in (stored, asked) for text, row in zip(query.texts, query.embeddings)}
     return replace(asked, texts=tuple(rows), embeddings=np.stack(list(rows.values())))

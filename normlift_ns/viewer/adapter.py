@@ -45,7 +45,7 @@ def handle_in_order(server: Any) -> None:
     """Make a server handle messages in the order in which they arrive.
 
     viser 0.2.7 passes each message to one of 32 threads. On a busy machine, a button press can therefore overtake the
-    text typed before it, and one of two quick presses is lost. With this function, each message waits until the
+    text typed before it, and one of two quick presses can be lost. With this function, each message waits until the
     previous message is handled, but for at most half a second.
 
     Args:

@@ -202,7 +202,7 @@ class ObjectRows:
     def show(self, object_list: ObjectList) -> None:
         """Replace the listed objects; at most `MAX_OBJECT_ROWS` are shown."""
         self._objects, small = tuple(object_list.objects), object_list.in_smaller_parts
-        unlisted = [f"{object_list.left_out:,} smaller objects are not listed"] * (object_list.left_out > 0)
+        unlisted = [f"Smaller objects that are not listed: {object_list.left_out:,}"] * (object_list.left_out > 0)
         unlisted += [f"Gaussians in components too small to be objects: {small:,}"] * (small > 0)
         empty = "" if len(self._objects) > 0 else "No visible objects selected"
         self._summary.content = escape_mdx("; ".join(unlisted) or empty)

@@ -60,7 +60,7 @@ def test_of_many_objects_the_table_has_the_largest(lifted: Path, capsys) -> None
     print_catalog(replace(few, objects=many))
     shown = said(capsys)
     assert "1,042" in shown and "1,033" in shown and "1,032" not in shown
-    assert "red: 42 objects" in shown and "32 smaller objects" in shown and "--objects-dir" in shown
+    assert "red: 42 objects" in shown and "10 largest" in shown and "--objects-dir" in shown
 
 
 def test_table_boxes_and_document_say_the_same(written: Path) -> None:

@@ -59,7 +59,7 @@ LIFT = [
     ("--encoder words", "'words'", "--encoder"),
     ("--queries oragne", "oragne", "orange"),
     ("--threshold 0.5", "--threshold"),
-    ("--device cuda:x:", "--device must be auto, cpu or cuda, got 'cuda:x:'"),
+    ("--device cuda:x:", "--device must be auto, cpu or cuda, or a GPU such as cuda:1; got 'cuda:x:'"),
     ("--timestamp ../x", "'../x'", "folder name"),
     ("--timestamp old", "old exists", "--timestamp", "--output-dir", "--overwrite True"),
     ("--output-dir file", "file, given with --output-dir"),

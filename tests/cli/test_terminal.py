@@ -110,7 +110,7 @@ def test_the_next_command_is_a_line_of_its_own(little: Path, monkeypatch, capsys
     config = next(tmp_path.glob("deep-*/*/normlift/next/config.yml"))
     assert shown.splitlines()[-1] == f"ns-normlift-query --load-config {config} --text 'red mug'"
     words = " ".join(shown.replace("│", " ").split())
-    assert re.search(r"half of the Gaussians above 0\.\d", words) and re.search(r"% of the directions changed", words)
+    assert re.search(r"half are above 0\.\d", words) and re.search(r"% of the directions changed", words)
     assert "not visible in any image" in words
     assert run_entry(monkeypatch, lift.entrypoint, *flags, "--overwrite", "True", "--quiet") == 0
     assert capsys.readouterr().out.splitlines() == [shown.splitlines()[-1]]

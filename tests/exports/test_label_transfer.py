@@ -80,7 +80,7 @@ def test_what_is_no_cloud_is_refused(tmp_path):
         (tmp_path / "a.ply").write_text(content)
         with pytest.raises(InputError, match=message):
             read_cloud(tmp_path / "a.ply")
-    with pytest.raises(FileNotFoundError, match="--transfer"):
+    with pytest.raises(FileNotFoundError, match=r"none\.ply"):
         read_cloud(tmp_path / "none.ply")
 
 

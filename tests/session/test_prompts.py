@@ -96,5 +96,5 @@ def test_saving_keeps_what_is_saved():
     np.testing.assert_array_equal(both.embeddings, np.eye(3))
     assert merge_queries(None, two) is two and prompts_of_query(None) == ()
     for other in (posed("red", negatives=["green"]), posed("red", negatives=(), refined=False)):
-        with pytest.raises(InputError, match=f"2 prompts .*cosine.*{other.rule}"):
+        with pytest.raises(InputError, match=f"{other.rule} and cosine"):
             merge_queries(one, other)
