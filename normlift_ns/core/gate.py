@@ -16,6 +16,7 @@ from jaxtyping import Float64, Int32, Int64
 from torch import Tensor
 
 from normlift_ns.core.consensus import hash_to_unit
+from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.sparse import SparseRows, sum_equal_keys
 
@@ -57,11 +58,30 @@ def shared_region_cosines(
         first, second: Rows of the two Gaussians of every pair.
         level: Level of every region (default: the same for all). A level of a view counts as a view of its own.
     """
-    evidence, norm = lifted.evidence, lifted.scalars.norm
+    norm = lifted.scalars.norm
     usable = (norm[first] > 0) & (norm[second] > 0)
     first, second = first[usable], second[usable]
+    together, both = shared_views(lifted.evidence, first, second, level)
+    same = (both > 0) & (together >= SHARED_VIEWS * both)
+    u, v = lifted.directions(first[same]), lifted.directions(second[same])
+    return (u.double() * v.double()).sum(1)
+
+
+def shared_views(
+    evidence: Evidence,
+    first: Int64[Tensor, " p"],
+    second: Int64[Tensor, " p"],
+    level: Int64[Tensor, " s"] | None = None,
+) -> tuple[Float64[Tensor, " p"], Float64[Tensor, " p"]]:
+    """Return the number of views in which two Gaussians share a region, and the number of views with regions of both.
+
+    If a Gaussian lies in several regions of a view, the probability that both lie in the same region counts.
+
+    Args:
+        first, second, level: As in `shared_region_cosines`.
+    """
     if len(first) == 0:
-        return torch.zeros(0, dtype=torch.float64, device=norm.device)
+        return first.double(), first.double()
     group = evidence.region_view.long()
     if level is not None and len(level) > 0:
         group = group * (int(level.max()) + 1) + level.to(group.device)
@@ -72,12 +92,10 @@ def shared_region_cosines(
     together = _matched(entry[0], entry[1], share[0], share[1], width, len(first))
     groups = int(group.max()) + 1
     both = _matched(seen[0], seen[1], torch.ones_like(seen[0]), torch.ones_like(seen[1]), groups, len(first))
-    same = (both > 0) & (together >= SHARED_VIEWS * both)
-    u, v = lifted.directions(first[same]), lifted.directions(second[same])
-    return (u.double() * v.double()).sum(1)
+    return together, both
 
 
-def relative_gate(cosines: Float64[Tensor, " q"]) -> tuple[float, float] | None:
+def relative_gate(cosines: Float64[Tensor, " q"], quantile: float = GATE_QUANTILE) -> tuple[float, float] | None:
     """Return tau and gamma for the cosines of `shared_region_cosines`, or None if there are fewer than 50.
 
     Both are rounded to four digits, so that rounding errors of the lift do not change them.
@@ -87,7 +105,7 @@ def relative_gate(cosines: Float64[Tensor, " q"]) -> tuple[float, float] | None:
     """
     if len(cosines) < _LEAST_PAIRS:
         return None
-    position = GATE_QUANTILE * (len(cosines) - 1)
+    position = quantile * (len(cosines) - 1)
     tau = round(min(float(cosines.sort().values[int(position)]), MAX_TAU), 4)
     return tau, round((1 - tau) / 2, 4)
 
