@@ -133,12 +133,15 @@ FORMS = (
 LATER = (
     TODAY,
     DEFAULT,
+    replace(TODAY, seen=0.2),
+    Form(seen=0.2),
     *(replace(DEFAULT, quantile=x) for x in (0.1, 0.2, 0.35, 0.5)),
-    *(replace(DEFAULT, local=True, quantile=x) for x in (0.05, 0.2, 0.5)),
+    *(replace(DEFAULT, local=True, quantile=x) for x in (0.05, 0.1, 0.2, 0.5)),
+    *(replace(DEFAULT, local=True, quantile=x, shared=0.5) for x in (0.05, 0.2)),
     *(replace(DEFAULT, shared=x, gated=gated) for gated in (True, False) for x in (ANY, 0.5, 0.8)),
     *(replace(DEFAULT, few=x) for x in (NONE, 1.0, 2.0, 4.0)),
 )
-"""The candidates of the second study, "The vote after a consensus" in research/studies.md."""
+"""The candidates of the second study, "The vote after a consensus" in research/studies.md, and the default for pieces."""
 
 
 def gate_of(form: Form, cosines: Tensor) -> tuple[float, float]:
