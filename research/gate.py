@@ -141,7 +141,7 @@ LATER = (
     *(replace(DEFAULT, shared=x, gated=gated) for gated in (True, False) for x in (ANY, 0.5, 0.8)),
     *(replace(DEFAULT, few=x) for x in (NONE, 1.0, 2.0, 4.0)),
 )
-"""The candidates of the second study, "The vote after a consensus" in research/studies.md, and the default for pieces."""
+"""Candidates of "The vote after a consensus" in research/studies.md, and the default for pieces of pictures."""
 
 
 def gate_of(form: Form, cosines: Tensor) -> tuple[float, float]:
