@@ -279,7 +279,7 @@ def measure(place: Capture, front: str, cache: Path, times: int, path: Path, *, 
             row = {**facts, "views": views, "drawn": indices, "B": observed.overlaps.agreement, "form": form.name}
             append(path, {**row, **more, "ap": place.scores(place.render(cosine), texts)})
             print(place.name, front, views, form.name, more, f"{perf_counter() - start:.1f} s", flush=True)
-        for name, cosine, more in observed.later(table) if later else ():
+        for name, cosine, more in observed.later(table) if later and (views == "all" or front == "edges m") else ():
             row = {**facts, "views": views, "drawn": indices, "form": f"vote {name}"}
             append(path, {**row, **more, "ap": place.scores(place.render(cosine), texts)})
 
