@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
@@ -57,7 +57,7 @@ from normlift_ns.encoders.cache import cached
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import EvidenceCollection, ViewObservations
 from normlift_ns.options import LiftOptions, RefineConfig
-from normlift_ns.pipeline import min_agreement, plan_collection
+from normlift_ns.pipeline import KernelWarmUp, min_agreement, plan_collection
 from normlift_ns.progress import StageTimer
 from research import gate
 from research.batched_votes import CHUNK, parts, voters_of
@@ -286,7 +286,7 @@ def measure(place: Capture, front: str, cache: Path, times: int, path: Path, *, 
 
 def observe(collection: EvidenceCollection, place: Capture, least: float) -> Observed:
     """Collect the evidence of some views."""
-    views = collection.collect(StageTimer(lambda stage, done, total: None), lambda: None)
+    views = collection.collect(StageTimer(lambda stage, done, total: None), KernelWarmUp())
     return Observed(views, place.gaussians.means, place.neighbors, least)
 
 
@@ -332,7 +332,7 @@ def main(arguments: argparse.Namespace) -> None:
     done = {(row["capture"], row["front"]) for row in read_rows(arguments.rows, {})}
     for name in arguments.captures:
         place = Capture(name, arguments.device)
-        with TemporaryDirectory() as cache:  # the fronts share learned edges
+        with nullcontext(arguments.cache / name) if arguments.cache else TemporaryDirectory() as cache:
             for front in arguments.fronts:
                 if (name, front) not in done:
                     measure(place, front, Path(cache), arguments.draws, arguments.rows, later=arguments.later)
@@ -346,5 +346,6 @@ if __name__ == "__main__":
     parser.add_argument("--draws", type=int, default=3, help="choices of few views")
     parser.add_argument("--later", action="store_true", help="the candidates of `research.gate --later` too")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--cache", type=Path, help="folder of features and regions that stays, one folder per capture")
     parser.add_argument("--rows", type=Path, default=RESULTS / "real_gain_rows.jsonl", help="finished rows")
     main(parser.parse_args())
