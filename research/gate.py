@@ -130,10 +130,12 @@ FORMS = (
     Form(0.98, 0.01, seen=0.2),
     *(replace(gate, forced=True) for gate in (TODAY, Form(), Form(seen=0.2))),
 )
+PIECES = replace(TODAY, seen=0.2)
+"""The default for pieces of pictures, whose consensus stays off."""
 LATER = (
     TODAY,
     DEFAULT,
-    replace(TODAY, seen=0.2),
+    PIECES,
     Form(seen=0.2),
     *(replace(DEFAULT, quantile=x) for x in (0.1, 0.2, 0.35, 0.5)),
     *(replace(DEFAULT, local=True, quantile=x) for x in (0.05, 0.1, 0.2, 0.5)),
@@ -141,7 +143,7 @@ LATER = (
     *(replace(DEFAULT, shared=x, gated=gated) for gated in (True, False) for x in (ANY, 0.5, 0.8)),
     *(replace(DEFAULT, few=x) for x in (NONE, 1.0, 2.0, 4.0)),
 )
-"""Candidates of "The vote after a consensus" in research/studies.md, and the default for pieces of pictures."""
+"""Candidates of "The vote after a consensus" in research/studies.md."""
 
 
 def gate_of(form: Form, cosines: Tensor) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
     python -m research.real_gain --device cuda          fox, castle and tabletop; results/real_gain.json
     python -m research.real_gain --captures fox --fronts "edges m" --draws 1
+    python -m research.real_gain --device cuda --later  votes of `research.gate --later`; results/real_votes.json
 
 Labels and prototypes are those of `research.cut`. A text is a prototype, or a label whose word the encoder knows. Its
 cosine is rendered into the images that show the label, whose pixels are pooled. Front ends: the three levels of learned
@@ -171,7 +172,7 @@ class Observed:
         measured = None
         if form.gate != "fixed" and self.overlaps.agreement > self.least:
             cosines = shared_region_cosines(lifted, *self.pairs)
-            measured = gate_at(cosines, float(form.gate))
+            measured = relative_gate(cosines, float(form.gate))
         tau, gamma = measured or (0.9, 0.05)
         config = RefineConfig(tau=tau, gamma=gamma, min_labeled=0.0 if form.old else None)
         own = torch.where(lifted.scalars.norm > 0, self.seen.scalars.own_evidence, 0.0)
@@ -180,15 +181,6 @@ class Observed:
             self.means, lifted.directions, r, config, own=own, labeled=self.labeled, neighbors=self.neighbors
         ).long()
         return plain[source], {"tau": tau, "copied": float((source != everyone).float().mean())}
-
-
-def gate_at(cosines: Tensor, quantile: float) -> tuple[float, float] | None:
-    """The measured gate at another quantile."""
-    found = relative_gate(cosines)
-    if found is None or quantile == 0.05:
-        return found
-    tau = min(float(cosines.sort().values[int(quantile * (len(cosines) - 1))]), 0.9985)
-    return tau, (1 - tau) / 2
 
 
 def largest(overlaps: Overlaps, least: float) -> Overlaps:
@@ -300,23 +292,23 @@ def recognition(observed: Observed, front: str, least: float) -> None:
     print(f"{front}: lift {seconds[0]:.2f} s, recognition {seconds[1]:.2f} s: {found}", flush=True)
 
 
-def write(path: Path) -> None:
-    """Write the results from rows."""
-    report, table = Report("real_gain"), {}
+def write(path: Path, *, later: bool) -> None:
+    """Write the results from rows; of the candidates of `gate.LATER` alone if asked for."""
+    report, table = Report("real_votes" if later else "real_gain"), {}
     for row in read_rows(path, {}):
         table.setdefault((row["capture"], row["front"], row["views"], row["form"]), []).append(row["ap"])
     for (name, front, views, form), found in table.items():
         key = f"{name}.{front}"
-        if form in ("images", "lift", "default") and views == "all":
+        if form in ("images", "lift", "default") and views == "all" and not later:
             for text, value in found[0].items():
                 report.add(f"{key}.{text}.{form}", value, "average precision")
-        if form in ("images", "lift"):
+        if form in ("images", "lift") or later != form.startswith("vote "):
             continue
         before = table[name, front, views, "lift"]
         gains = {text: mean(100 * (x[text] - y[text]) for x, y in zip(found, before)) for text in found[0]}
         labels = [gain for text, gain in gains.items() if not text.startswith("word ")]
         words = [gain for text, gain in gains.items() if text.startswith("word ")]
-        key = f"{key}.{views}.{form}"
+        key = f"{key}.{views}.{form.removeprefix('vote ')}"
         report.add(f"{key}.mean", mean(labels), "points over the lift, prototypes")
         report.add(f"{key}.worst", min(labels), "points over the lift, the worst prototype")
         if form not in {x.name for x in BASE}:
@@ -336,7 +328,7 @@ def main(arguments: argparse.Namespace) -> None:
             for front in arguments.fronts:
                 if (name, front) not in done:
                     measure(place, front, Path(cache), arguments.draws, arguments.rows, later=arguments.later)
-    write(arguments.rows)
+    write(arguments.rows, later=arguments.later)
 
 
 if __name__ == "__main__":
