@@ -1,7 +1,10 @@
 """Gates of the vote and ways to abstain, on the frozen grid: gains, edges, answers mended and broken.
 
     python -m research.gate --workers 12                all scenes; for a GPU
+    python -m research.gate --later --workers 12        the candidates of the second study
     python -m research.gate --quick                     a small room and three cells, for the tests
+
+The second study, with its rule, is "The vote after a consensus" in research/studies.md. The rest is about the first.
 
 Every form votes after the consensus with the posterior vote. Its gate is fixed (tau, gamma) or relative (`core.gate`).
 It may abstain, so that a Gaussian keeps its direction:

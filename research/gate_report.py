@@ -36,15 +36,15 @@ def cells_of_rows(rows: Sequence[Row]) -> dict[Cell, list[Row]]:
 
 
 def by_kind(rows: Sequence[Row]) -> dict[str, list[float]]:
-    """Gains of the default over the lift alone in all cells of a kind of region, without statistic real."""
+    """Gains of the default over the lift alone in all cells of a kind of region; statistic real is one of its own."""
     cells: dict[Cell, list[Row]] = {}
     for row in rows:
         cells.setdefault(Cell(*row["cell"]), []).append(row)
-    return {
-        kind: [value(some, "miou", form.name, "lift") for cell, some in cells.items()
-               if cell.kind == kind and cell.statistic != REAL]
-        for kind, form in FRONT_ENDS.items()
-    }  # fmt: skip
+    found: dict[str, list[float]] = {}
+    for cell, some in cells.items():
+        kind = REAL if cell.statistic == REAL else cell.kind
+        found.setdefault(kind, []).append(value(some, "miou", FRONT_ENDS[cell.kind].name, "lift"))
+    return found
 
 
 def value(rows: Sequence[Row], key: str, name: str, base: str | None = None) -> float:
@@ -155,9 +155,8 @@ def main(arguments: argparse.Namespace) -> None:
                 if math.isfinite(x):
                     report.add(f"{label}.{name}.{key}", x, "points; ratio; share")
         for kind, gains in by_kind([row for row in rows if row["cell"][0] in scenes]).items():
-            if len(gains) > 0:
-                report.add(f"{label}.default.{kind}.gain", mean(gains), "points")
-                report.add(f"{label}.default.{kind}.worst", min(gains), "points")
+            report.add(f"{label}.default.{kind}.gain", mean(gains), "points")
+            report.add(f"{label}.default.{kind}.worst", min(gains), "points")
         judged = {cell: kept for cell, some in cells.items() if (kept := [row for row in some if "R" in row])}
         for kind, x in (reliabilities(judged) if judged else {}).items():
             print(f"R {kind:12}", {key: round(v, 3) for key, v in x.items()})
