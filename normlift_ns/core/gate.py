@@ -100,6 +100,9 @@ def relative_gate(cosines: Float64[Tensor, " q"], quantile: float = GATE_QUANTIL
 
     Both are rounded to four digits, so that rounding errors of the lift do not change them.
 
+    Args:
+        quantile: Share of the cosines that are below tau, in 0..1.
+
     >>> relative_gate(torch.linspace(0.8, 1.0, 101, dtype=torch.float64))
     (0.81, 0.095)
     """
@@ -124,6 +127,8 @@ def _matched(
 
     Keys ascend, and pair i has the keys from i * width to (i + 1) * width - 1.
     """
+    if len(b) == 0:
+        return torch.zeros(pairs, dtype=torch.float64, device=a.device)
     place = torch.searchsorted(b, a).clamp(max=len(b) - 1)
     equal = b[place] == a
     products = at[equal].double() * bt[place[equal]].double()
