@@ -1,7 +1,10 @@
 """Gates of the vote and ways to abstain, on the frozen grid: gains, edges, answers mended and broken.
 
     python -m research.gate --workers 12                all scenes; for a GPU
+    python -m research.gate --later --workers 12        the candidates of the second study
     python -m research.gate --quick                     a small room and three cells, for the tests
+
+The second study, with its rule, is "The vote after a consensus" in research/studies.md. The rest is about the first.
 
 Every form votes after the consensus with the posterior vote. Its gate is fixed (tau, gamma) or relative (see
 `core.refine.relative_gate`). It may abstain, so that a Gaussian keeps its direction:
@@ -63,7 +66,7 @@ from normlift_ns.core.consensus import (
 )
 from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.metrics import classify
-from normlift_ns.core.refine import relative_gate, shared_region_cosines
+from normlift_ns.core.refine import MAX_TAU, relative_gate, shared_region_cosines, shared_views
 from normlift_ns.core.reliability import independent_views, pair_reliability, reliability
 from research.batched_votes import CHUNK, Voters, mious, parts
 from research.candidates import Candidate
@@ -92,15 +95,29 @@ class Form:
     seen: float = 0.0
     forced: bool = False
     """The consensus runs at full strength."""
+    quantile: float = 0.05
+    """Of the relative gate."""
+    local: bool = False
+    """Every Gaussian has a relative gate of its own."""
+    shared: float = 0.0
+    """Only neighbors vote that share a region in this share of the views that see both; `ANY`: in any view."""
+    gated: bool = True
+    few: float = 0.0
+    """Only Gaussians whose own evidence is below this number of views may change; `NONE`: those without direction."""
 
     @property
     def name(self) -> str:
         gate = "relative" if self.tau is None else f"{self.tau:g} {self.gamma:g}"
+        gate = "local" if self.local else gate if self.gated else "no gate"
+        gate += f" {self.quantile:g}" if self.quantile != 0.05 else ""
         more = [f"{key} {getattr(self, key):g}" for key in KEYS if getattr(self, key)]
         return " ".join(["forced"] * self.forced + [gate, *more])
 
 
-KEYS = ("delta", "quorum", "margin", "low", "seen")
+KEYS = ("delta", "quorum", "margin", "low", "seen", "shared", "few")
+ANY, NONE = 1e-3, 1e-6
+LEAST = 4
+"""Smallest number of neighbors that share the region for a gate of one's own."""
 TODAY = Form(0.9, 0.05)
 DEFAULT = Form(seen=0.2, forced=True)
 """What the rule chose, for masks."""
@@ -115,17 +132,74 @@ FORMS = (
     Form(0.98, 0.01, seen=0.2),
     *(replace(gate, forced=True) for gate in (TODAY, Form(), Form(seen=0.2))),
 )
+PIECES = replace(TODAY, seen=0.2)
+"""The default for pieces of pictures, whose consensus stays off."""
+LATER = (
+    TODAY,
+    DEFAULT,
+    PIECES,
+    Form(seen=0.2),
+    *(replace(DEFAULT, quantile=x) for x in (0.1, 0.2, 0.35, 0.5)),
+    *(replace(DEFAULT, local=True, quantile=x) for x in (0.05, 0.1, 0.2, 0.5)),
+    *(replace(DEFAULT, local=True, quantile=x, shared=0.5) for x in (0.05, 0.2)),
+    *(replace(DEFAULT, shared=x, gated=gated) for gated in (True, False) for x in (ANY, 0.5, 0.8)),
+    *(replace(DEFAULT, few=x) for x in (NONE, 1.0, 2.0, 4.0)),
+)
+"""Candidates of "The vote after a consensus" in research/studies.md."""
 
 
-def gate_of(form: Form, measured: tuple[float, float] | None) -> tuple[float, float]:
+def gate_of(form: Form, cosines: Tensor) -> tuple[float, float]:
     """tau and gamma; today's where the relative gate cannot be measured."""
-    return (form.tau, form.gamma) if form.tau is not None else (measured or (0.9, 0.05))
+    if not form.gated:
+        return -1.0, 0.05
+    if form.tau is not None:
+        return form.tau, form.gamma
+    return relative_gate(cosines, form.quantile) or (TODAY.tau or 0.0, TODAY.gamma)
+
+
+def local_gate(part: Any, form: Form, together: Tensor, default: float) -> tuple[Tensor, Tensor]:
+    """[m, 1, 1] tau and gamma of every voter, from the neighbors that share its region."""
+    cosine = part.gram[:, 0, 1:].float().masked_fill(~together, torch.inf).sort(1).values
+    count = together.sum(1)
+    place = (form.quantile * (count - 1).clamp(min=0)).long()
+    tau = torch.where(count >= LEAST, cosine.gather(1, place[:, None]).squeeze(1), default).clamp(max=MAX_TAU)
+    return tau[:, None, None], (1 - tau[:, None, None]) / 2
 
 
 def decided(
-    part: Any, gate: tuple[float, float], forms: Sequence[Form], labeled: Tensor
+    part: Any, gate: tuple[float, float], forms: Sequence[Form], labeled: Tensor, views: tuple[Tensor, Tensor]
 ) -> list[tuple[Tensor, Tensor]]:
-    """[m] place in N+ whose direction is taken, and cosine with the own one, by forms of the same gate."""
+    """[m] place in N+ whose direction is taken, and cosine with the own one, by forms of the same gate.
+
+    Args:
+        views: [m, K] numbers of views in which a neighbor shares the region, and that see both.
+    """
+    whole = decided_among(part, gate, [form for form in forms if not form.shared and not form.local], labeled)
+    found = []
+    for form in forms:
+        if not form.shared and not form.local:
+            found.append(next(whole))
+            continue
+        together, both = views
+        share = max(form.shared, 0.5) if form.local else form.shared
+        near = together >= (0.5 if share == ANY else share * both)
+        near &= part.group[:, 1:] >= 0
+        own = local_gate(part, form, near & (both > 0), gate[0]) if form.local else gate
+        found.append(next(decided_among(voted(part, near) if form.shared else part, own, [form], labeled)))
+    return found
+
+
+def voted(part: Any, near: Tensor) -> Any:
+    """The part with those neighbors alone; voters without a direction keep all."""
+    kept = torch.nn.functional.pad(near | (part.norm[:, :1] == 0), (1, 0), value=True)
+    norm, n_eff = (torch.where(kept, x, 0.0) for x in (part.norm, part.n_eff))
+    return replace(part, norm=norm, n_eff=n_eff)
+
+
+def decided_among(part: Any, gate: tuple[Any, Any], forms: Sequence[Form], labeled: Tensor) -> Iterator[Any]:
+    """As `decided`, among all neighbors that are reliable."""
+    if len(forms) == 0:
+        return
     tau, gamma = gate
     r, weight, _ = part.terms(Candidate("posterior", sigma_d=2.0))
     sigmoid = torch.sigmoid((part.gram.float() - tau) / gamma)
@@ -134,13 +208,12 @@ def decided(
     score = r * agreed
     best, choice = score[:, 1:].max(1)
     row, winner = torch.arange(len(r), device=r.device), choice + 1
-    full = 4.0 * float(torch.sigmoid(torch.tensor((1 - tau) / gamma)))
+    full = 4.0 * torch.sigmoid((1 - torch.as_tensor(tau)) / gamma).flatten().to(r)
     near = (agreed[row, winner] - weight[:, 0] * sigmoid[row, winner, 0]) / full
     lead = (agreed[row, winner] - agreed[:, 0]) / full
     square = (part.distance / 2.0) ** 2
     decay = torch.where(part.group[:, 1:] >= 0, torch.exp(-0.5 * square[:, 1:]), 0.0)
     mean = (r[:, 1:] * decay).sum(1) / decay.sum(1).clamp(min=1e-12)
-    found = []
     for form in forms:
         wins = (best > score[:, 0] + form.delta) & (r[:, 1:] > 0).any(1) & (near >= form.quorum)
         if form.margin > 0:
@@ -149,18 +222,29 @@ def decided(
             wins &= r[:, 0] < form.low * mean
         if form.seen > 0:
             wins &= labeled >= form.seen
+        if form.few > 0:
+            wins &= weight[:, 0] < form.few
         place = torch.where(wins, winner, 0)
-        found.append((place, part.gram.float()[row, place, 0]))
-    return found
+        yield place, part.gram.float()[row, place, 0]
 
 
-def measured_gate(lifted: Lifted, voters: Voters) -> tuple[float, float] | None:
-    """The relative gate, from a neighbor of each of at most 20,000 voters."""
+def measured_cosines(lifted: Lifted, voters: Voters) -> Tensor:
+    """The cosines of the relative gate, from a neighbor of each of at most 20,000 voters."""
     own = voters.group[:, 0]
     slot = (hash_to_unit(own) * (voters.group.shape[1] - 1)).long() + 1
     other = voters.group.gather(1, slot[:, None]).squeeze(1)
     keep = (other >= 0).nonzero().squeeze(1)[:20_000]
-    return relative_gate(shared_region_cosines(lifted, own[keep], other[keep]))
+    return shared_region_cosines(lifted, own[keep], other[keep])
+
+
+def neighbor_views(evidence: Evidence, group: Tensor) -> tuple[Tensor, Tensor]:
+    """[m, K] numbers of views in which a neighbor shares the region of the voter, and that see both."""
+    there = group[:, 1:] >= 0
+    own = group[:, :1].expand_as(there)[there]
+    together, both = (torch.zeros(there.shape, dtype=torch.float32, device=group.device) for _ in range(2))
+    found = shared_views(evidence, own, group[:, 1:][there])
+    together[there], both[there] = (x.float() for x in found)
+    return together, both
 
 
 def agreed_lifts(
@@ -222,7 +306,9 @@ def edge_of(site: Site, voters: Voters) -> Tensor:
     return other.sum(1) > EDGE * (near >= 0).sum(1)
 
 
-def observed_forms(site: Site, cell: Cell, seed: int, *, judge: bool = False) -> dict[str, Any]:
+def observed_forms(
+    site: Site, cell: Cell, seed: int, all_forms: Sequence[Form] = FORMS, *, judge: bool = False
+) -> dict[str, Any]:
     """Everything of one observation; with left-out views if asked for."""
     observed = site.observed(cell, seed)
     words = site.looks if cell.statistic == "histogram" else site.words[cell.statistic]
@@ -240,12 +326,15 @@ def observed_forms(site: Site, cell: Cell, seed: int, *, judge: bool = False) ->
     weight = observed.evidence.rows.select_rows(own).row_sums()
     labeled = torch.where(weight + blank > 0, weight / (weight + blank), 1.0)
     names, before = ["lift", "consensus", "forced consensus"], [0, 0, 0]
-    gates = {}
+    gates, views = {}, None
+    if any(form.shared or form.local for form in all_forms):
+        views = [neighbor_views(observed.evidence, x) for x in voters.group.split(CHUNK[own.device.type])]
     for forced, lifted in lifts.items():
         scores = lifted_scores(lifted, classes)
         plain = classify(scores.cosine, scores.valid)
-        measured = gates[forced] = measured_gate(lifted, voters)
-        forms = [form for form in FORMS if form.forced == forced]
+        measured = measured_cosines(lifted, voters)
+        gates[forced] = relative_gate(measured)
+        forms = [form for form in all_forms if form.forced == forced]
         by_gate: dict[tuple[float, float], list[Form]] = {}
         for form in forms:
             by_gate.setdefault(gate_of(form, measured), []).append(form)
@@ -253,8 +342,9 @@ def observed_forms(site: Site, cell: Cell, seed: int, *, judge: bool = False) ->
         for start, part in enumerate(parts(lifted, voters, cosines=True)):
             first = start * CHUNK[own.device.type]
             share = labeled[first : first + len(part.group)]
+            near = views[start] if views is not None else (share, share)
             for gate, some in by_gate.items():
-                for form, (place, cosine) in zip(some, decided(part, gate, some, share), strict=True):
+                for form, (place, cosine) in zip(some, decided(part, gate, some, share, near), strict=True):
                     found[form].append((part.group.gather(1, place[:, None]).squeeze(1), cosine))
         for form in forms:
             source, cosine = (torch.cat(x) for x in zip(*found[form]))
@@ -289,7 +379,13 @@ def site_of(place: Place, settings: Settings) -> Site:
 
 @torch.no_grad()
 def run_cells(
-    cells: Sequence[Cell], settings: Settings, seeds: Sequence[int], path: Path, deadline: float, judge: bool
+    cells: Sequence[Cell],
+    settings: Settings,
+    seeds: Sequence[int],
+    path: Path,
+    deadline: float,
+    judge: bool,
+    later: bool,
 ) -> None:
     """Cells of one place; of pieces of the picture with the first seed alone."""
     for cell in cells:
@@ -297,7 +393,8 @@ def run_cells(
             if time.time() > deadline:
                 return
             site = site_of(Place.of(cell), settings)
-            append(path, {"cell": list(cell), "seed": seed, **observed_forms(site, cell, seed, judge=judge)})
+            found = observed_forms(site, cell, seed, LATER if later else FORMS, judge=judge)
+            append(path, {"cell": list(cell), "seed": seed, **found})
 
 
 def jobs_of(cells: Sequence[Cell], size: int) -> Iterator[list[Cell]]:
@@ -323,9 +420,8 @@ def main(arguments: argparse.Namespace) -> None:
         cells = [cell for cell in cells if cell.statistic == "clip" and cell.kind == "masks" and cell.damage == "mild"]
     done = {(*row["cell"], row["seed"]) for row in read_rows(arguments.rows, {})}
     cells = [cell for cell in cells if any((*cell, seed) not in done for seed in seeds)]
-    jobs = [
-        (some, settings, seeds, arguments.rows, deadline, arguments.judge) for some in jobs_of(cells, arguments.chunk)
-    ]
+    kind = (arguments.rows, deadline, arguments.judge, arguments.later)
+    jobs = [(some, settings, seeds, *kind) for some in jobs_of(cells, arguments.chunk)]
     if arguments.workers == 1:
         for job in jobs:
             run_cells(*job)
@@ -345,6 +441,7 @@ if __name__ == "__main__":
     parser.add_argument("--minutes", type=float, default=1e6, help="no observation begins later than this")
     parser.add_argument("--judge", action="store_true", help="measure the recognition of left-out views too")
     parser.add_argument("--statistics", nargs="+", help="cells of these statistics alone")
+    parser.add_argument("--later", action="store_true", help="the candidates of the second study")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--rows", type=Path, default=RESULTS / "gate_rows.jsonl", help="finished observations")
     main(parser.parse_args())

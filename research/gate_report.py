@@ -1,4 +1,4 @@
-"""The decision of `research.gate`, from its rows.
+"""The figures of `research.gate --later`, from its rows, and the targets of its first rule.
 
 python -m research.gate_report            prints tables; results/gate.json
 """
@@ -12,15 +12,15 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from research.gate import DEFAULT, TODAY
+from research.gate import DEFAULT, LATER, PIECES, TODAY
 from research.report import RESULTS, Report
 from research.rows import read_rows
-from research.rule import CHOICE, CONFIRMATION, Cell
+from research.rule import CHOICE, CONFIRMATION, REAL, Cell
 
 Row = dict[str, Any]
 Cells = Mapping[Cell, Sequence[Row]]
-WRITTEN = ("consensus", "forced consensus", TODAY.name, "0.98 0.01", "relative", "relative seen 0.2", DEFAULT.name)
-"""Forms in the report; all are printed."""
+FRONT_ENDS = {"masks": DEFAULT, "patches": PIECES, "superpixels": PIECES, "grid": PIECES}
+"""The default by kind of region."""
 WORST = {"all": 0.7, "6": 2.0, "3": 2.5}
 """Largest loss of a cell, points."""
 
@@ -32,6 +32,18 @@ def cells_of_rows(rows: Sequence[Row]) -> dict[Cell, list[Row]]:
         cell = Cell(*row["cell"])
         if cell.kind == "masks":
             found.setdefault(cell, []).append(row)
+    return found
+
+
+def by_kind(rows: Sequence[Row]) -> dict[str, list[float]]:
+    """Gains of the default over the lift alone in all cells of a kind of region; statistic real is one of its own."""
+    cells: dict[Cell, list[Row]] = {}
+    for row in rows:
+        cells.setdefault(Cell(*row["cell"]), []).append(row)
+    found: dict[str, list[float]] = {}
+    for cell, some in cells.items():
+        kind = REAL if cell.statistic == REAL else cell.kind
+        found.setdefault(kind, []).append(value(some, "miou", FRONT_ENDS[cell.kind].name, "lift"))
     return found
 
 
@@ -138,9 +150,13 @@ def main(arguments: argparse.Namespace) -> None:
         print(" " * 34 + " ".join(f"{key.replace('undamaged', 'und')[:9]:>9}" for key in keys))
         for name in order:
             print(f"{name:34}" + " ".join(f"{found[name].get(key, math.nan):9.2f}" for key in keys))
-        for name in WRITTEN:
+        for name in ("consensus", "forced consensus", *(form.name for form in LATER)):
             for key, x in found[name].items():
-                report.add(f"{label}.{name}.{key}", x, "points; ratio; share")
+                if math.isfinite(x):
+                    report.add(f"{label}.{name}.{key}", x, "points; ratio; share")
+        for kind, gains in by_kind([row for row in rows if row["cell"][0] in scenes]).items():
+            report.add(f"{label}.default.{kind}.gain", mean(gains), "points")
+            report.add(f"{label}.default.{kind}.worst", min(gains), "points")
         judged = {cell: kept for cell, some in cells.items() if (kept := [row for row in some if "R" in row])}
         for kind, x in (reliabilities(judged) if judged else {}).items():
             print(f"R {kind:12}", {key: round(v, 3) for key, v in x.items()})

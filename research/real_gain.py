@@ -2,6 +2,7 @@
 
     python -m research.real_gain --device cuda          fox, castle and tabletop; results/real_gain.json
     python -m research.real_gain --captures fox --fronts "edges m" --draws 1
+    python -m research.real_gain --device cuda --later  votes of `research.gate --later`; results/real_votes.json
 
 Labels and prototypes are those of `research.cut`. A text is a prototype, or a label whose word the encoder knows. Its
 cosine is rendered into the images that show the label, whose pixels are pooled. Front ends: the three levels of learned
@@ -33,7 +34,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
@@ -52,11 +53,14 @@ from normlift_ns.core.neighbors import Neighbors
 from normlift_ns.core.refine import labeled_share, relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.build import make_source
+from normlift_ns.encoders.cache import cached
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import EvidenceCollection, ViewObservations
 from normlift_ns.options import LiftOptions, RefineConfig
-from normlift_ns.pipeline import min_agreement, plan_collection
+from normlift_ns.pipeline import KernelWarmUp, min_agreement, plan_collection
 from normlift_ns.progress import StageTimer
+from research import gate
+from research.batched_votes import CHUNK, parts, voters_of
 from research.cut import label_masks, prototypes, region_rows
 from research.report import RESULTS, Report
 from research.rows import append, read_rows
@@ -119,6 +123,30 @@ class Observed:
         self.overlaps = region_overlaps(self.sampled.rows, evidence.region_view, self.chance, total)
         self._lifts: dict[Any, nl.Lifted] = {}
 
+    def later(self, vectors: Tensor) -> Iterator[tuple[str, Tensor, dict[str, Any]]]:
+        """Yield cosines [N, T] of the candidates of `gate.LATER`, and their shares of copies and changes."""
+        lifted, n, device = self.lifted(DEFAULT), len(self.means), self.means.device
+        everyone = torch.arange(n, device=device)
+        own = torch.where(lifted.scalars.norm > 0, self.seen.scalars.own_evidence, 0.0)
+        norm = own / self.seen.scalars.n_eff.clamp(min=1e-9)
+        lifted = replace(lifted, scalars=replace(lifted.scalars, norm=norm))
+        voters = voters_of(self.neighbors, everyone, n)
+        cosines = shared_region_cosines(lifted, *self.pairs)
+        source, forms = {form: everyone.clone() for form in gate.LATER}, list(gate.LATER)
+        turned = dict.fromkeys(forms, 0.0)
+        for rows, part in zip(everyone.split(CHUNK[device.type]), parts(lifted, voters, cosines=True), strict=True):
+            near = [gate.neighbor_views(self.views.evidence, x) for x in part.group.split(2**12)]
+            near = tuple(torch.cat(x) for x in zip(*near))
+            for form in forms:
+                found = gate.decided(part, gate.gate_of(form, cosines), [form], self.labeled[rows], near)
+                place, cosine = found[0]
+                source[form][rows] = part.group.gather(1, place[:, None]).squeeze(1)
+                turned[form] += float(((place > 0) & (cosine < gate.CHANGED)).sum())
+        plain = torch.cat([lifted.directions(rows) @ vectors.T for rows in everyone.split(2**14)])
+        for form, taken in source.items():
+            copied = float((taken != everyone).float().mean())
+            yield form.name, plain[taken], {"copied": copied, "changed": turned[form] / n}
+
     def lifted(self, form: Form) -> nl.Lifted:
         """The lift after the consensus of a form, with R of before."""
         if form.power is None:
@@ -140,11 +168,11 @@ class Observed:
         plain = torch.cat([lifted.directions(rows) @ vectors.T for rows in everyone.split(2**14)])
         if form.gate is None:
             return plain, {}
-        gate = None
+        measured = None
         if form.gate != "fixed" and self.overlaps.agreement > self.least:
             cosines = shared_region_cosines(lifted, *self.pairs)
-            gate = gate_at(cosines, float(form.gate))
-        tau, gamma = gate or (0.9, 0.05)
+            measured = relative_gate(cosines, float(form.gate))
+        tau, gamma = measured or (0.9, 0.05)
         config = RefineConfig(tau=tau, gamma=gamma, min_labeled=0.0 if form.old else None)
         own = torch.where(lifted.scalars.norm > 0, self.seen.scalars.own_evidence, 0.0)
         r = torch.where(lifted.scalars.norm > 0, lifted.scalars.reliability, 0.0)
@@ -152,15 +180,6 @@ class Observed:
             self.means, lifted.directions, r, config, own=own, labeled=self.labeled, neighbors=self.neighbors
         ).long()
         return plain[source], {"tau": tau, "copied": float((source != everyone).float().mean())}
-
-
-def gate_at(cosines: Tensor, quantile: float) -> tuple[float, float] | None:
-    """The measured gate at another quantile."""
-    found = relative_gate(cosines)
-    if found is None or quantile == 0.05:
-        return found
-    tau = min(float(cosines.sort().values[int(quantile * (len(cosines) - 1))]), 0.9985)
-    return tau, (1 - tau) / 2
 
 
 def largest(overlaps: Overlaps, least: float) -> Overlaps:
@@ -218,10 +237,10 @@ class Capture:
         return drawn
 
 
-def measure(place: Capture, front: str, cache: Path, times: int, path: Path) -> None:
+def measure(place: Capture, front: str, cache: Path, times: int, path: Path, *, later: bool) -> None:
     """Append the rows of one capture and front end."""
     options, source = LiftOptions(), make_source(FRONTS[front], place.device)
-    rows = region_rows(source, place.views, place.masks)
+    rows = region_rows(cached(source, cache), place.views, place.masks)
     vectors = prototypes(rows, place.masks)
     texts = [(label, label) for label in vectors]
     for label in list(vectors):
@@ -244,18 +263,21 @@ def measure(place: Capture, front: str, cache: Path, times: int, path: Path) -> 
         observed = observe(replace(full, views=indices), place, least)
         if views == "all":
             recognition(observed, front, least)
-        forms = (*BASE, *CANDIDATES) if views == "all" and front.startswith("edges") else BASE
-        for form in forms:
+        tried = () if later or views != "all" or not front.startswith("edges") else CANDIDATES
+        for form in (*BASE, *tried):
             start = perf_counter()
             cosine, more = observed.answers(form, table)
             row = {**facts, "views": views, "drawn": indices, "B": observed.overlaps.agreement, "form": form.name}
             append(path, {**row, **more, "ap": place.scores(place.render(cosine), texts)})
             print(place.name, front, views, form.name, more, f"{perf_counter() - start:.1f} s", flush=True)
+        for name, cosine, more in observed.later(table) if later and (views == "all" or front == "edges m") else ():
+            row = {**facts, "views": views, "drawn": indices, "form": f"vote {name}"}
+            append(path, {**row, **more, "ap": place.scores(place.render(cosine), texts)})
 
 
 def observe(collection: EvidenceCollection, place: Capture, least: float) -> Observed:
     """Collect the evidence of some views."""
-    views = collection.collect(StageTimer(lambda stage, done, total: None), lambda: None)
+    views = collection.collect(StageTimer(lambda stage, done, total: None), KernelWarmUp())
     return Observed(views, place.gaussians.means, place.neighbors, least)
 
 
@@ -269,23 +291,23 @@ def recognition(observed: Observed, front: str, least: float) -> None:
     print(f"{front}: lift {seconds[0]:.2f} s, recognition {seconds[1]:.2f} s: {found}", flush=True)
 
 
-def write(path: Path) -> None:
-    """Write the results from rows."""
-    report, table = Report("real_gain"), {}
+def write(path: Path, *, later: bool) -> None:
+    """Write the results from rows; of the candidates of `gate.LATER` alone if asked for."""
+    report, table = Report("real_votes" if later else "real_gain"), {}
     for row in read_rows(path, {}):
         table.setdefault((row["capture"], row["front"], row["views"], row["form"]), []).append(row["ap"])
     for (name, front, views, form), found in table.items():
         key = f"{name}.{front}"
-        if form in ("images", "lift", "default") and views == "all":
+        if form in ("images", "lift", "default") and views == "all" and not later:
             for text, value in found[0].items():
                 report.add(f"{key}.{text}.{form}", value, "average precision")
-        if form in ("images", "lift"):
+        if form in ("images", "lift") or later != form.startswith("vote "):
             continue
         before = table[name, front, views, "lift"]
         gains = {text: mean(100 * (x[text] - y[text]) for x, y in zip(found, before)) for text in found[0]}
         labels = [gain for text, gain in gains.items() if not text.startswith("word ")]
         words = [gain for text, gain in gains.items() if text.startswith("word ")]
-        key = f"{key}.{views}.{form}"
+        key = f"{key}.{views}.{form.removeprefix('vote ')}"
         report.add(f"{key}.mean", mean(labels), "points over the lift, prototypes")
         report.add(f"{key}.worst", min(labels), "points over the lift, the worst prototype")
         if form not in {x.name for x in BASE}:
@@ -301,11 +323,11 @@ def main(arguments: argparse.Namespace) -> None:
     done = {(row["capture"], row["front"]) for row in read_rows(arguments.rows, {})}
     for name in arguments.captures:
         place = Capture(name, arguments.device)
-        for front in arguments.fronts:
-            if (name, front) not in done:
-                with TemporaryDirectory() as cache:
-                    measure(place, front, Path(cache), arguments.draws, arguments.rows)
-    write(arguments.rows)
+        with nullcontext(arguments.cache / name) if arguments.cache else TemporaryDirectory() as cache:
+            for front in arguments.fronts:
+                if (name, front) not in done:
+                    measure(place, front, Path(cache), arguments.draws, arguments.rows, later=arguments.later)
+    write(arguments.rows, later=arguments.later)
 
 
 if __name__ == "__main__":
@@ -313,6 +335,8 @@ if __name__ == "__main__":
     parser.add_argument("--captures", nargs="+", default=list(CAPTURES), choices=CAPTURES)
     parser.add_argument("--fronts", nargs="+", default=list(FRONTS), choices=list(FRONTS))
     parser.add_argument("--draws", type=int, default=3, help="choices of few views")
+    parser.add_argument("--later", action="store_true", help="the candidates of `research.gate --later` too")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--cache", type=Path, help="folder of features and regions that stays, one folder per capture")
     parser.add_argument("--rows", type=Path, default=RESULTS / "real_gain_rows.jsonl", help="finished rows")
     main(parser.parse_args())

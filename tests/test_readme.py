@@ -122,24 +122,26 @@ def test_options_that_are_named_exist():
 
 def test_the_readme_is_short_and_its_figures_are_those_of_the_results():
     from research.documents import documents  # noqa: PLC0415 (scikit-image)
-    from research.grid_report import DEFAULT  # noqa: PLC0415
     from research.tables import tables  # noqa: PLC0415
 
     assert len(README.splitlines()) <= 130
-    made, shown, real = tables(documents()), README.split("## Accuracy")[1], documents()["grid_real"]
+    made, shown = tables(documents()), README.split("## Accuracy")[1]
     header, *columns = [line.strip("| ").split(" | ") for line in made["grid-columns"].splitlines()]
     rows = [line for line in shown.splitlines() if line.startswith("| `--")]
     shown = " ".join(shown.split())
     for row, kind in zip(rows, ("masks", "patches", "superpixels"), strict=True):
         cells = next(cells for cells in columns if cells[0] == f"kind: {kind}")
-        wanted = " | ".join(cells[header.index(method)] for method in ("paper", DEFAULT))
-        assert row.endswith(f"| {wanted} |"), row
-    gain, worst = real.interval(f"choice.{DEFAULT}.gain"), -real.values[f"choice.{DEFAULT}.worst"]
-    assert f"is {gain}, {worst:.1f} in the worst cell" in shown
+        gain, worst = (metric("gate", f"choice.default.{kind}.{key}") for key in ("gain", "worst"))
+        assert row.endswith(f"| {cells[header.index('paper')]} | {gain:+.1f} ({worst:+.1f}) |"), row
+    gain, worst = (metric("gate", f"choice.default.real.{key}") for key in ("gain", "worst"))
+    assert f"is {gain:.1f}, {worst:.1f} in the worst cell" in shown
+    rooms = [metric("gate", f"{room}.default.masks.gain") for room in ("second", "third")]
+    assert f"{rooms[0]:.1f} and {rooms[1]:.1f} points with masks" in shown
+    form = "forced relative seen 0.2"
+    damaged, least = (metric("gate", f"choice.{form}.{key}") for key in ("damaged", "worst 3"))
+    assert f"gains {damaged:.1f} points of mIoU" in shown and f"{least:.1f} with 3" in shown
     hard = next(line for line in made["reliability-tabletop"].splitlines() if line.startswith("| hard |"))
     assert "51 to 100 %" in hard and "51 % of the Gaussians in its lowest tenth are right, and 100 %" in shown
-    for table, gain in (("grid-second", "5.1 ± 0.8"), ("grid-third", "5.1 ± 1.0")):
-        assert gain in made[table].splitlines()[2] and gain in shown
 
 
 def metric(document: str, key: str) -> float:

@@ -16,7 +16,6 @@ from normlift_ns.core.consensus import hash_to_unit
 from normlift_ns.core.device import can_use_triton, retry_in_halves
 from normlift_ns.core.evidence import Evidence, check_not_negative
 from normlift_ns.core.lift import Lifted, check_unit_rows
-from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
 from normlift_ns.core.partition import PARTITION_BLOCK, spatial_order
 from normlift_ns.core.sparse import SparseRows, sum_equal_keys
 from normlift_ns.errors import InputError
@@ -412,11 +411,30 @@ def shared_region_cosines(
         first, second: Rows of the two Gaussians of every pair.
         level: Level of every region (default: the same for all). A level of a view counts as a view of its own.
     """
-    evidence, norm = lifted.evidence, lifted.scalars.norm
+    norm = lifted.scalars.norm
     usable = (norm[first] > 0) & (norm[second] > 0)
     first, second = first[usable], second[usable]
+    together, both = shared_views(lifted.evidence, first, second, level)
+    same = (both > 0) & (together >= SHARED_VIEWS * both)
+    u, v = lifted.directions(first[same]), lifted.directions(second[same])
+    return (u.double() * v.double()).sum(1)
+
+
+def shared_views(
+    evidence: Evidence,
+    first: Int64[Tensor, " p"],
+    second: Int64[Tensor, " p"],
+    level: Int64[Tensor, " s"] | None = None,
+) -> tuple[Float64[Tensor, " p"], Float64[Tensor, " p"]]:
+    """Return the number of views in which two Gaussians share a region, and the number of views with regions of both.
+
+    If a Gaussian lies in several regions of a view, the probability that both lie in the same region counts.
+
+    Args:
+        first, second, level: As in `shared_region_cosines`.
+    """
     if len(first) == 0:
-        return torch.zeros(0, dtype=torch.float64, device=norm.device)
+        return first.double(), first.double()
     group = evidence.region_view.long()
     if level is not None and len(level) > 0:
         group = group * (int(level.max()) + 1) + level.to(group.device)
@@ -427,22 +445,23 @@ def shared_region_cosines(
     together = _matched(entry[0], entry[1], share[0], share[1], width, len(first))
     groups = int(group.max()) + 1
     both = _matched(seen[0], seen[1], torch.ones_like(seen[0]), torch.ones_like(seen[1]), groups, len(first))
-    same = (both > 0) & (together >= SHARED_VIEWS * both)
-    u, v = lifted.directions(first[same]), lifted.directions(second[same])
-    return (u.double() * v.double()).sum(1)
+    return together, both
 
 
-def relative_gate(cosines: Float64[Tensor, " q"]) -> tuple[float, float] | None:
+def relative_gate(cosines: Float64[Tensor, " q"], quantile: float = GATE_QUANTILE) -> tuple[float, float] | None:
     """Return tau and gamma for the cosines of `shared_region_cosines`, or None if there are fewer than 50.
 
     Both are rounded to four digits, so that rounding errors of the lift do not change them.
+
+    Args:
+        quantile: Share of the cosines that are below tau, in 0..1.
 
     >>> relative_gate(torch.linspace(0.8, 1.0, 101, dtype=torch.float64))
     (0.81, 0.095)
     """
     if len(cosines) < _LEAST_PAIRS:
         return None
-    position = GATE_QUANTILE * (len(cosines) - 1)
+    position = quantile * (len(cosines) - 1)
     tau = round(min(float(cosines.sort().values[int(position)]), MAX_TAU), 4)
     return tau, round((1 - tau) / 2, 4)
 
@@ -461,6 +480,8 @@ def _matched(
 
     Keys ascend, and pair i has the keys from i * width to (i + 1) * width - 1.
     """
+    if len(b) == 0:
+        return torch.zeros(pairs, dtype=torch.float64, device=a.device)
     place = torch.searchsorted(b, a).clamp(max=len(b) - 1)
     equal = b[place] == a
     products = at[equal].double() * bt[place[equal]].double()

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from normlift_ns import lift, nearest_neighbors
-from normlift_ns.core.refine import relative_gate, sample_pairs, shared_region_cosines
+from normlift_ns.core.refine import relative_gate, sample_pairs, shared_region_cosines, shared_views
 from tests.random_scenes import dense, generator, random_evidence, unit_rows
 
 COUNTS = [3, 2, 4, 1, 3, 2]
@@ -43,6 +43,14 @@ def test_cosines_are_those_of_neighbors_that_share_regions(levels):
     torch.testing.assert_close(found.sort().values, torch.tensor(wanted, dtype=torch.float64).sort().values)
 
 
+def test_gaussians_without_evidence_share_no_region():
+    rows = random_evidence(6, COUNTS, seed=3, fill=0.5)
+    together, both = shared_views(rows.select_gaussians(torch.tensor([], dtype=torch.int64)), *torch.empty(2, 0).long())
+    assert len(together) == len(both) == 0
+    empty = random_evidence(6, COUNTS, seed=3, fill=0.0)
+    assert [x.tolist() for x in shared_views(empty, torch.tensor([0, 1]), torch.tensor([2, 3]))] == [[0, 0], [0, 0]]
+
+
 def test_pairs_depend_on_the_index_alone_however_gaussians_are_divided():
     means = torch.rand(500, 3, generator=generator(0))
     neighbors = nearest_neighbors(means, 7).index
@@ -61,5 +69,6 @@ def test_gate_is_a_quantile_and_needs_pairs():
     tau, gamma = relative_gate(cosines) or (0.0, 0.0)
     assert abs(float((cosines < tau).double().mean()) - 0.05) < 0.002
     assert gamma == pytest.approx((1 - tau) / 2, abs=1e-4)
+    assert (relative_gate(cosines, 0.5) or (0.0, 0.0))[0] == pytest.approx(float(cosines.median()), abs=1e-4)
     assert relative_gate(cosines[:49]) is None
     assert relative_gate(torch.ones(100, dtype=torch.float64)) == (0.9985, 0.0007)
