@@ -16,6 +16,7 @@ from normlift_ns.core.consensus import hash_to_unit
 from normlift_ns.core.device import can_use_triton, retry_in_halves
 from normlift_ns.core.evidence import Evidence, check_not_negative
 from normlift_ns.core.lift import Lifted, check_unit_rows
+from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
 from normlift_ns.core.partition import PARTITION_BLOCK, spatial_order
 from normlift_ns.core.sparse import SparseRows, sum_equal_keys
 from normlift_ns.errors import InputError
