@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from normlift_ns.server.client import connect as connect
 
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _HOMES = {
     "analysis.explain": "Why",

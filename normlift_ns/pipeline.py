@@ -135,8 +135,8 @@ def lift_run(
         load_step: As in `open_scene`; allowed only with a config.
         output_dir: Output folder, instead of the outputs folder of the trained run.
         timestamp: Name of the new run directory. If None, use the current time, with a number if such a run exists.
-        overwrite: Replace an existing run directory of that name, and exported files whose content differs.
-        check_alignment: Compare three training images with renders of the scene before the lift. Warn if they differ,
+        overwrite: Replace an existing run directory of that name. For exported files, see `FeatureExport.overwrite`.
+        check_alignment: Compare a few training images with renders of the scene before the lift. Warn if they differ,
             and raise if they do not show the same scene.
         device: Device to lift on: auto, cpu or cuda.
         export: Folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
@@ -366,8 +366,8 @@ class LiftResult(NamedTuple):
 
     field: SemanticField
     seconds: dict[str, float]
-    """Duration of each stage, in order: features, evidence, consensus and recognition (if enabled), lift, neighbors,
-    vote, store."""
+    """Duration of each stage, in order: features, evidence, consensus, recognition, lift, neighbors, vote, store.
+    Stages that the options disable are left out."""
 
 
 def lift_scene(

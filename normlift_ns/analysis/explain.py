@@ -110,6 +110,9 @@ class Why:
     """R of the selection. This number, `norm`, `c_intra`, `c_inter` and `n_eff` treat the selection as one Gaussian."""
     views: tuple[ViewVote, ...]
     """Votes of the images with weight > 0, by descending weight."""
+    copied: int = 0
+    """Number of selected Gaussians that use the direction of another one. This value of version 0.2 will be removed.
+    Use `changed` instead."""
 
     @property
     def most_different(self) -> tuple[ViewVote, ...]:
@@ -188,7 +191,8 @@ def explain_selection(
     }
     table = features.to(joined.rows.weight.device)[joined.rows.column.long()].double()
     views = _votes(joined, torch.nn.functional.normalize(table, dim=1))
-    return Why(len(rows), _changed_share(evidence, features, rows, origin), **scalars, views=views)
+    copied = int((origin != rows).sum())
+    return Why(len(rows), _changed_share(evidence, features, rows, origin), **scalars, views=views, copied=copied)
 
 
 def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: Tensor) -> float:

@@ -41,7 +41,7 @@ _LENGTH_TOLERANCE = 1e-2
 class Scalars(TensorRecord):
     """Norm, consistency, reliability and weight of every Gaussian.
 
-    If W_j < 1e-15 or f_j = 0, all fields except `view_count` and `weight` are 0.
+    If W_j < 1e-15, or f_j = 0 up to rounding, all fields except `view_count` and `weight` are 0.
 
     >>> import torch
     >>> from normlift_ns import Evidence, lift

@@ -191,7 +191,7 @@ def refine_subset(
     ends = can_change.cumsum(0)[size - 1 : -1 : size].tolist()
     for block in voters[can_change].tensor_split(ends):
         if len(block) > 0:
-            retry_in_halves(vote, block, "run the vote on the CPU")
+            retry_in_halves(vote, block, "lift on the CPU (--device cpu), or give `refine` tensors on the CPU")
         done = min(done + size, len(voters))
         if progress is not None and len(voters) > 0:
             progress(done, len(voters))
@@ -368,7 +368,7 @@ def _gather(values: Tensor, index: Tensor) -> Tensor:
 # of one object agree closely, and this agreement can be measured in the lift. Let `same` be the cosines of lifted
 # directions of neighbors that share a region in at least half of the views that show both:
 #
-#     tau   = 5 % quantile of same
+#     tau   = 5 % quantile of same, at most 0.9985
 #     gamma = (1 - tau) / 2
 
 
@@ -392,7 +392,7 @@ def sample_pairs(
 
     Args:
         gaussians: Index of every row among all n Gaussians.
-        neighbors: Neighbors of every row, -1 for none.
+        neighbors: Neighbors of every row, -1 for none. Rows for which -1 is chosen are left out.
     """
     number, share = hash_to_unit(gaussians), min(1.0, _PAIRS / max(1, n))
     row = (number < share).nonzero().squeeze(1)
@@ -405,6 +405,8 @@ def shared_region_cosines(
     lifted: Lifted, first: Int64[Tensor, " p"], second: Int64[Tensor, " p"], level: Int64[Tensor, " s"] | None = None
 ) -> Float64[Tensor, " q"]:
     """Return <u_i, u_k> of the pairs that share a region in at least half of the views that show both.
+
+    Pairs with a Gaussian without a direction are left out.
 
     Args:
         first, second: Rows of the two Gaussians of every pair.

@@ -15,7 +15,7 @@ w::
     R_j  = (max(0, N_j ||f_j|| ** 2 - 1) + beta r) / (N_j - 1 + beta),   r = 0.02
 
 For N views of equal weight with unit features, (N ||f|| ** 2 - 1) / (N - 1) is the mean cosine of these features over
-pairs of views. A Gaussian in a single view has no pairs, so R = r.
+pairs of views. A single view has no pairs, so R = r if beta > 0, and R = 0 if beta = 0.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ DRIFT = 21.7
 """Angle in degrees at which the correlation between features of the same object part falls to 1/e, measured on
 photographs."""
 LEAST_RELIABILITY = 0.02
-"""R of a Gaussian without any pair of agreeing views. It is positive, because R = 0 means no evidence."""
+"""r, the R of a Gaussian in a single view if beta > 0. It is positive, because R = 0 means no evidence."""
 _CHUNK_ELEMENTS = 2**22
 
 

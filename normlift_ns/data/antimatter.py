@@ -22,7 +22,7 @@ def read_antimatter(path: Path) -> SplatFile:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file size is not a multiple of 32 bytes, or the Gaussians cannot be rendered.
+        ValueError: The file is empty, its size is not a multiple of 32 bytes, or the Gaussians cannot be rendered.
     """
     if not path.is_file():
         raise FileNotFoundError(f"The .splat file {path} does not exist. Give an existing file with --load-ply.")

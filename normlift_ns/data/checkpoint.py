@@ -115,7 +115,7 @@ class Checkpoint(NamedTuple):
     path: Path
     step: int
     model: dict[str, Tensor]
-    """State of the model on the CPU, without LPIPS. Tensors named gauss_params.* are in float32."""
+    """State of the model on the CPU, without LPIPS. The parameters of the Gaussians are in float32."""
     splat: SplatParameters
     """Parameters of the Gaussians, from gauss_params.* in the state."""
 
@@ -195,7 +195,7 @@ def validate_step(step: Any, path: Path) -> int:
     if type(step) is not int or not 0 <= step < _MAX_STEP:  # a bool is not a step
         raise InputError(
             f"{path}: its step is {str(step)[:40]} ({type(step).__name__}), expected a whole number from 0 to "
-            f"{_MAX_STEP:,}. Copy it again, or give another checkpoint."
+            f"{_MAX_STEP - 1:,}. Copy it again, or give another checkpoint."
         )
     expected = _step_of(path)
     if expected is not None and expected != step:
@@ -260,15 +260,14 @@ def _check_archive(path: Path, advice: str) -> None:
                     f"{path} declares more content than its {size:,} bytes, or contains compressed entries, which "
                     f"torch.save never writes. Copy it again, or {advice}."
                 )
-            damage = archive.testzip()
+            wrong = archive.testzip()
+            damage = None if wrong is None else f"the checksum of {wrong} does not match its content"
     except InputError:
         raise
     except Exception as error:  # zipfile raises any kind of exception on a damaged file
         damage = str(error)
     if damage is not None:
-        raise InputError(
-            f"{path} is damaged ({damage}): a checksum does not match its content. Copy it again, or {advice}."
-        )
+        raise InputError(f"{path} is damaged ({damage}). Copy it again, or {advice}.")
 
 
 def _model_state(pipeline: dict[Any, Any], path: Path) -> dict[str, Tensor]:
@@ -330,9 +329,9 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
     splats = [splat_from_parameters(rank.parameters, file) for file, rank in zip(files, loaded)]
     steps = {rank.step for rank in loaded}
     if len(steps) > 1 or len({splat.degree for splat in splats}) > 1:
-        steps_named = f"steps: {', '.join(map(str, sorted(steps)))}"
+        differing = f"steps: {', '.join(map(str, sorted(steps)))}" if len(steps) > 1 else "degrees of harmonics"
         raise InputError(
-            f"{files[0].parent} has ranks with different {steps_named if len(steps) > 1 else 'spherical harmonics'}. "
+            f"{files[0].parent} has ranks with different {differing}. "
             "Expected the files of one training run. Copy these files to a separate folder."
         )
     names = splats[0].parameters

@@ -64,8 +64,8 @@ def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor],
     _check_element(path, "vertex", vertex, _VERTEX, "u")
     assert chunk is not None
     if n > len(chunk) * _CHUNK_ROWS or (harmonics is not None and len(harmonics) != n):
-        extra = "" if harmonics is None else f" and {len(harmonics):,} rows of spherical harmonics"
-        raise _unmatched(path, f"{n:,} Gaussians in {len(chunk):,} chunks of 256{extra}, expected matching numbers")
+        extra = "" if harmonics is None else f", {len(harmonics):,} spherical harmonics"
+        raise _unmatched(path, f"its numbers of rows do not match ({n:,} Gaussians, {len(chunk):,} chunks{extra})")
     words = {name: torch.from_numpy(vertex[name].astype(np.int64)) for name in _VERTEX}
     rotation, color = words["packed_rotation"], _units(words["packed_color"], (8, 8, 8, 8))
     means, scales = (_bounds(chunk, group, n) for group in ("means", "scales"))
@@ -151,7 +151,7 @@ def _check_element(path: Path, element: str, table: np.ndarray | None, names: tu
 
 def _unmatched(path: Path, problem: str) -> InputError:
     return InputError(
-        f"{path} is a damaged compressed PLY file with {problem}. Write it again, or give the uncompressed PLY file."
+        f"{path} is a damaged compressed PLY file: {problem}. Write it again, or give the uncompressed PLY file."
     )
 
 
@@ -175,7 +175,7 @@ def _unpack_harmonics(path: Path, table: np.ndarray | None, n: int) -> Float[Ten
         return torch.zeros(n, 0, 3)
     _check_element(path, "sh", table, names, "u")
     if len(names) not in (9, 24, 45, 72):
-        raise _unmatched(path, f"{len(names)} spherical harmonics, expected 9, 24, 45 or 72")
+        raise _unmatched(path, f"it has {len(names)} spherical harmonics, expected 9, 24, 45 or 72")
     packed = torch.from_numpy(np.stack([table[name].astype(np.float32) for name in names], axis=1))
     units = torch.where(packed == 0, 0.0, torch.where(packed == 255, 1.0, (packed + 0.5) / 256))
     return ((units - 0.5) * _SH_RANGE).reshape(n, 3, -1).transpose(1, 2).contiguous()

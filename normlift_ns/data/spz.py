@@ -247,7 +247,7 @@ def _fractional_bits(means: Float[Tensor, "n 3"]) -> int:
 
 
 def _bits_of_step(step: float) -> int:
-    """Return the smallest number of fractional bits with steps of at most this length."""
+    """Return the smallest number of fractional bits with steps of at most this length; the largest for length 0."""
     return min(_MAX_FRACTIONAL_BITS, max(0, math.ceil(-math.log2(step)))) if step > 0 else _MAX_FRACTIONAL_BITS
 
 

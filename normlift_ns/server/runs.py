@@ -338,15 +338,23 @@ class ServedRun:
                 del self._memories[old]
             return found, token
 
-    def warm_up(self) -> None:
-        """Compute in advance the data that the first page needs."""
+    def warm_up(self, wait: Callable[[], None]) -> None:
+        """Compute in advance what `describe` returns, and then the further data that the first page needs.
+
+        Args:
+            wait: Function that returns when there is time for the next part of the further data.
+        """
         _ = self.geometry, self.examples
+        for part in (self._compile_renderer, lambda: self.space.neighbor_pairs, lambda: self.pca):
+            wait()
+            part()
+
+    def _compile_renderer(self) -> None:
         view = self.first_view
         if view is not None:
             codes = Codes([(0, 0, 0, 0.0, 0)], np.zeros(len(self.rows), np.uint8))
-            self.still(codes, view.camera(64))  # compiles the renderer
+            self.still(codes, view.camera(64))
             self.weights(view.position, np.subtract(view.look_at, view.position).tolist())
-        _ = self.space.neighbor_pairs, self.pca
 
     @property
     def in_use(self) -> bool:
@@ -422,13 +430,13 @@ class RunStore:
                         del self._open[other]
             return served
 
-    def warm_up(self) -> None:
-        """Compute in advance the data that the first page of each open run needs, one run after another."""
+    def warm_up(self, wait: Callable[[], None]) -> None:
+        """Compute in advance the data that the first page of each open run needs; see `ServedRun.warm_up`."""
         for name in self.ids:
             with self._lock:
                 served, _ = self._open.get(name, (None, 0))
             if served is not None:
-                served.warm_up()
+                served.warm_up(wait)
 
 
 def _estimated_bytes(run: LiftedRun) -> int:

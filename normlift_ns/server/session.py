@@ -281,7 +281,8 @@ class PageSession:
         return self._visible(actions.click(state, weights, value.mode))  # pyright: ignore[reportArgumentType]
 
     def _select_object(self, state: State, value: protocol.ObjectAction) -> State:
-        return self._visible(actions.change_objects(state, self._object(value.id).mask, value.mode))
+        row = self._object(value.id)
+        return self._visible(actions.change_objects(state, row.mask, value.mode, row.text))
 
     def _select_region(self, state: State, value: protocol.Region | protocol.Brush) -> State:
         mask = region_mask(self._run, state, value)

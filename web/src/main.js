@@ -10,7 +10,7 @@ import { startTooltips, toast } from "./notices.js";
 import { Stills } from "./stills.js";
 import { Tools, TOOLS } from "./tools.js";
 import { View3D } from "./view.js";
-import { showExplanation } from "./why.js";
+import { closeStaleExplanation, showExplanation } from "./why.js";
 
 /** @type {[string, string, string][]} Color mode, label and tooltip. */
 const MODES = [
@@ -386,6 +386,7 @@ class Page {
     this.state = state;
     this.search.show(state);
     this.panel.show(state);
+    closeStaleExplanation(state);
     for (const [mode] of MODES) $(`mode-${mode}`).setAttribute("aria-checked", String(mode === state.color_mode));
     this.scene?.setOutline(OUTLINED.includes(state.color_mode) && state.selected > 0);
     this.showLegend(state);
