@@ -1,8 +1,13 @@
-"""Reliabilities from the agreement of pairs of views, optionally weighted by the angles between views.
+"""Reliability R_j of every Gaussian, from the length of its mean feature and the number of views that show it.
 
-Features of one Gaussian in two views differ more if the angle between the views is larger. Views from nearby cameras
-therefore tend to have the same errors. Let theta_vw be the angle between the directions from Gaussian j to the cameras
-of views v and w::
+The paper's R shrinks the agreement ||f_j|| of the views by their effective number (eq. 8)::
+
+    R_j  = ||f_j|| N_eff / (N_eff + beta)                     paper
+
+The other kinds measure the agreement of pairs of views, optionally weighted by the angles between views. Features of
+one Gaussian in two views differ more if the angle between the views is larger. Views from nearby cameras therefore tend
+to have the same errors. Let theta_vw be the angle between the directions from Gaussian j to the cameras of views v and
+w::
 
     s_vw = exp(-theta_vw / 21.7 degrees)
     N_j  = N_eff                                              pairs
@@ -27,6 +32,52 @@ photographs."""
 LEAST_RELIABILITY = 0.02
 """r, the R of a Gaussian in a single view if beta > 0. It is positive, because R = 0 means no evidence."""
 _CHUNK_ELEMENTS = 2**22
+
+
+def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], beta: float) -> Float[Tensor, "*n"]:
+    """Return R_j, equation 8 of the paper, or 0 without evidence.
+
+    Args:
+        norm: ||f_j||. With 1, the result is the factor N_eff / (N_eff + beta).
+        n_eff: N_eff, or 0 without evidence.
+        beta: Prior strength as a number of views, >= 0.
+
+    >>> reliability(0.6, torch.tensor([0.0, 2.0]), beta=1.0)
+    tensor([0.0000, 0.4000])
+    """
+    return torch.where(n_eff > 0, norm * n_eff / (n_eff + beta), 0.0)
+
+
+def norm_of_reliability(
+    reliability: Float[Tensor, " n"], n_eff: Float[Tensor, " n"], beta: float
+) -> Float64[Tensor, " n"]:
+    """Return ||f_j|| from R_j, the inverse of `reliability`.
+
+    After a consensus, R_j and therefore the result are those of the features before the consensus.
+
+    Args:
+        reliability: The paper's R_j.
+        n_eff: N_eff, or 0 without evidence.
+        beta: Prior strength, as for `reliability`.
+    """
+    views = n_eff.double()
+    return torch.where(views > 0, reliability.double() * (views + beta) / views, 0.0).clamp(max=1)
+
+
+def pair_reliability(norm: Float[Tensor, " n"], views: Float[Tensor, " n"], beta: float) -> Float[Tensor, " n"]:
+    """Return R_j from pairs of views, the last formula at the top of this module, or 0 without evidence.
+
+    Args:
+        norm: ||f_j||.
+        views: N_j, from `Scalars.n_eff` or `independent_views`.
+        beta: Prior strength, in views, >= 0.
+
+    >>> pair_reliability(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), beta=1.0)
+    tensor([0.0200, 0.5100, 0.0000])
+    """
+    agreed = (views * norm**2 - 1).clamp(min=0) + beta * LEAST_RELIABILITY
+    value = agreed / (views - 1 + beta).clamp(min=1e-6)
+    return torch.where((norm > 0) & (views > 0), value.clamp(max=1), 0.0)
 
 
 def independent_views(
@@ -63,19 +114,3 @@ def independent_views(
         shared = ((weight[:, :, None] * repeated).sum(1) * weight).sum(1).double()
         out[rows] = torch.where(shared > 0, 1 / shared, 0.0)
     return out
-
-
-def pair_reliability(norm: Float[Tensor, " n"], views: Float[Tensor, " n"], beta: float) -> Float[Tensor, " n"]:
-    """Return R_j by the formula at the top of this module, or 0 without evidence.
-
-    Args:
-        norm: ||f_j||.
-        views: N_j, from `Scalars.n_eff` or `independent_views`.
-        beta: Prior strength, in views, >= 0.
-
-    >>> pair_reliability(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), beta=1.0)
-    tensor([0.0200, 0.5100, 0.0000])
-    """
-    agreed = (views * norm**2 - 1).clamp(min=0) + beta * LEAST_RELIABILITY
-    value = agreed / (views - 1 + beta).clamp(min=1e-6)
-    return torch.where((norm > 0) & (views > 0), value.clamp(max=1), 0.0)
