@@ -107,7 +107,7 @@ def describe_error(error: BaseException) -> tuple[str, int]:
 
 
 _NO_MEMORY = re.compile(r"DefaultCPUAllocator|can't allocate memory|can't start new thread|std::bad_alloc")
-"""Messages of torch and Python that report full memory."""
+"""Parts of messages with which torch and Python usually report full memory."""
 
 
 def _user_message(error: BaseException) -> str | None:

@@ -327,8 +327,8 @@ def check_not_negative(name: str, values: Tensor) -> None:
     if len(bad) > 0:
         first = int(bad[0, 0])
         raise InputError(
-            f"{len(bad):,} of {values.numel():,} values of {name} are negative or not finite, for example "
-            f"{name}[{first}] = {float(values[first]):g}"
+            f"{len(bad):,} of {values.numel():,} values of {name} {'is' if len(bad) == 1 else 'are'} negative or not "
+            f"finite, for example {name}[{first}] = {float(values[first]):g}"
         )
 
 

@@ -277,5 +277,6 @@ def check_unit_rows(
     bad = (~(good | (length == 0) if allow_zeros else good)).nonzero().squeeze(1)
     if bad.numel() > 0:
         examples = ", ".join(f"row {i} has length {length[i]:.3g}" for i in bad[:3].tolist())
-        raise InputError(f"{bad.numel():,} of {len(rows):,} {name} are not unit vectors ({examples}); {advice}")
+        fault = "is not a unit vector" if bad.numel() == 1 else "are not unit vectors"
+        raise InputError(f"{bad.numel():,} of {len(rows):,} {name} {fault} ({examples}); {advice}")
     return length

@@ -48,7 +48,7 @@ class Neighbors(NamedTuple):
     index: Int32[Tensor, "m k"]  # pyright: ignore[reportIncompatibleMethodOverride]
     """Indices of the neighbors, padded with -1 if fewer than K other Gaussians have finite means."""
     distance: Float[Tensor, "m k"]
-    """Euclidean distances in the units of the means, padded with inf. Float64, or rounded to float32 on a GPU."""
+    """Euclidean distances in the units of the means, padded with inf. Float64, or float32 from the search on a GPU."""
     spacing: Float64[Tensor, " m"]
     """Distance to the nearest Gaussian at another position, or inf if there is none."""
 
@@ -65,9 +65,9 @@ def nearest_neighbors(
     """Find the exact K nearest neighbors in 3D, N_K(i) of the paper, excluding self.
 
     The CPU uses a k-d tree of the distinct positions, because any number of Gaussians may share a position. The GPU
-    uses `kernels.nearest`, which certifies the rows of its result. It cannot certify rows with more ties than
-    candidates. For these rows, the GPU computes all distances. If there are too many of them, the CPU repeats the
-    search. A Gaussian whose mean is not finite has no neighbors and is not a neighbor of others.
+    uses `kernels.nearest` for float32 means and K up to 60. This search certifies the rows of its result, except those
+    with more ties than candidates. For these rows, the GPU computes all distances. If there are too many of them, the
+    CPU repeats the search. A Gaussian whose mean is not finite has no neighbors and is not a neighbor of others.
 
     Args:
         of: Gaussians to find neighbors for, one per row of the result (default: all n).

@@ -373,7 +373,8 @@ def _gather(values: Tensor, index: Tensor) -> Tensor:
 
 
 GATE_QUANTILE = 0.05
-"""Fraction of the measured pairs of neighbors that have a cosine below tau. Their gate is less than one half."""
+"""Fraction of the measured pairs of neighbors that have a cosine below tau, if tau is below `MAX_TAU`. Their gate is
+less than one half."""
 SHARED_VIEWS = 0.5
 """Minimum fraction of views with a shared region, among the views that show both Gaussians."""
 MAX_TAU = 0.9985

@@ -59,7 +59,7 @@ class Heartbeat:
     def stop(self, well: bool) -> bool:
         """Stop the heartbeat, and notify the other processes that this process exits.
 
-        If the store is unreachable, process 0, which hosts it, has exited. Process 0 has then reported its own error,
+        If the store is unreachable, its host, usually process 0, has exited. Process 0 has then reported its own error,
         unless this process has detected the loss.
 
         Args:

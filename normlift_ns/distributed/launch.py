@@ -61,13 +61,15 @@ def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | Non
 
 
 def launch_processes(commands: Sequence[Sequence[str]], log: Callable[[str], None]) -> int:
-    """Run several processes on this machine that lift one scene together, and return the exit code.
+    """Run several processes on this machine that lift one scene together.
 
     If a process fails, all others are terminated. Each process reports its own errors.
 
     Args:
         commands: Command line of each process.
         log: Callback for a message about a process that a signal has killed.
+    Returns:
+        0 if all processes succeed, or the exit code of a process that failed (1 if a signal killed it).
     """
     count = len(commands)
     with socket.create_server(("127.0.0.1", 0)) as free:
@@ -98,7 +100,7 @@ def launch_processes(commands: Sequence[Sequence[str]], log: Callable[[str], Non
 
 
 def _watch(processes: Sequence[subprocess.Popen[bytes]], log: Callable[[str], None]) -> int:
-    """Wait for all processes; return 0 if all succeed, or the exit code of the first process that fails."""
+    """Wait for all processes, and return the exit code of `launch_processes`."""
     while True:
         codes = [process.poll() for process in processes]
         rank, code = next(((r, code) for r, code in enumerate(codes) if code), (0, 0))

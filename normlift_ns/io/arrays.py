@@ -26,7 +26,7 @@ from normlift_ns.io.guard import check_regular, open_regular
 from normlift_ns.io.memory import check_free_memory
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
-"""Largest number that a file may contain."""
+"""Largest float32 number, the default upper bound of `check_array`."""
 _BLOCK = 2**20
 """Number of float16 numbers that are compared at a time."""
 _SMALL_FILE = 2**20

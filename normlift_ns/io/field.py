@@ -84,7 +84,7 @@ class FieldArrays(NamedTuple):
     Fields that store evidence also have `features`. Other fields have `coordinates`; low-rank fields also have `basis`.
     """
     evidence: EvidenceArrays | None
-    """Evidence; None for the other storage forms."""
+    """Evidence for storage "evidence"; None for the other storage forms."""
     digested_files: frozenset[str]
     """Files that have a digest in the manifest, as paths relative to the folder of the manifest."""
 
@@ -114,7 +114,7 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
         rows.check("region weights", region_view.size)
         if not (0 <= views <= _MAX_VIEWS and power in (0, 1, 2) and 0 <= excluded <= len(rows.offsets) - 1):
             counts = ", ".join(map(str, (views, power, excluded)))
-            raise InputError(f"{', '.join(EVIDENCE_COUNTS)} are {counts[:50]}, which is out of range")
+            raise InputError(f"at least one of {', '.join(EVIDENCE_COUNTS)} is out of range: {counts[:50]}")
         unlabeled.check("weights of unlabeled pixels", views)
         if len(unlabeled.offsets) != len(rows.offsets):
             raise InputError(
@@ -166,7 +166,7 @@ def _check_field(
         if evidence is not None:
             check_array("features", arrays["features"], "float32", (len(evidence.region_view), dimension), -FLOAT32_MAX)
             if ((arrays["norm"] > 0) & (arrays["weight"] == 0)).any():
-                raise InputError("norm is above 0 for Gaussians with weight 0, expected norm 0")
+                raise InputError("some Gaussians have weight 0 and a norm above 0, expected norm 0 for weight 0")
             if len(evidence.rows.offsets) - 1 != n:
                 raise InputError(f"{EVIDENCE_FILE} has {len(evidence.rows.offsets) - 1} Gaussians, expected {n}")
             return

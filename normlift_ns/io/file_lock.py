@@ -40,7 +40,7 @@ class ClaimState(NamedTuple):
     number: int
     """Number of the latest attempt; 0 if no process has claimed the task yet."""
     outcome: str | None
-    """Outcome of that attempt; None while the attempt runs, or if its owner died."""
+    """Outcome of that attempt; None before the first attempt, while the attempt runs, or if its owner died."""
 
 
 UNCLAIMED = ClaimState(0, None)
@@ -179,7 +179,7 @@ def iter_claims(
     Args:
         keys: Names of the tasks.
         initial_states: Result of `read_claim_states` before the caller listed its tasks. Attempts that had already
-            ended are repeated; attempts that end later are not.
+            ended are repeated. Attempts that end later are repeated only if their outcome is `ABANDONED`.
         timeout: Seconds without a heartbeat after which another process may take over a task.
         clock: Function that returns the time in seconds; tests replace it.
         sleep: Function that waits for a number of seconds; tests replace it.

@@ -59,7 +59,11 @@ def read_file(path: str | Path, *, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
 
 
 def read_text(path: Path, encoding: str = "utf8") -> str:
-    """Return the text of a regular file with \\n as line endings, or raise the errors of `open_regular`."""
+    """Return the text of a regular file with \\n as line endings.
+
+    Raises:
+        FileNotFoundError, ValueError: The errors of `open_regular`, or the file has another encoding.
+    """
     return read_file(path).decode(encoding).replace("\r\n", "\n")  # a copy made on Windows may end lines with \r\n
 
 

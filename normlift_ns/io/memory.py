@@ -75,9 +75,10 @@ def check_free_memory(needed: int, what: str, needed_by_limit: Mapping[str, int]
     for name, free in free_memory().items():
         least = (needed_by_limit or {}).get(name, needed)
         if free < least:
+            advice = "Close other programs" if name == "the machine" else "Raise this limit"
             raise MemoryError(
                 f"{what} needs at least {least / 2**30:.2f} GiB of memory, but {name} leaves "
-                f"{max(0, free) / 2**30:.2f} GiB. Raise the limit, close other programs, or use a smaller scene."
+                f"{max(0, free) / 2**30:.2f} GiB. {advice}, or use a smaller scene."
             )
 
 
@@ -87,7 +88,8 @@ def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = T
     Args:
         gaussians: Number of Gaussians.
         pixels: Number of pixels of a view.
-        loaded: False if torch is not imported yet. The estimate for `ulimit -v` then includes its libraries.
+        loaded: False if torch is not imported yet. The estimate then includes its libraries for `ulimit -v`, and half a
+            GiB for other limits.
     Raises:
         MemoryError: The lift does not fit. The message gives the estimate.
     """

@@ -64,7 +64,8 @@ def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> 
             raise InputError(f"the {kind} must be a string, got {folder!r:.60}")
         if folder.startswith(".") or folder.strip() == "" or {"/", "\\"} & set(folder) or not folder.isprintable():
             raise InputError(
-                f"the {kind} {folder!r} is not a valid folder name; give a name without slashes, such as 'run'"
+                f"the {kind} {folder!r} is not a valid folder name; give a name that does not start with a dot and has "
+                "no slashes, such as 'run'"
             )
         if len(os.fsencode(folder)) > _MAX_NAME_BYTES:
             raise InputError(
@@ -192,7 +193,8 @@ def written_files(run_dir: Path) -> set[str]:
     """Return the paths of the files that a lift wrote, relative to the run directory.
 
     They are config.yml, the manifest, the stored queries, and the files that the manifest lists. If the manifest is
-    damaged or from version 0.1, the default names of all files that a lift writes are used instead of its list.
+    missing, damaged or from version 0.1, the default names of all files that a lift writes are used instead of its
+    list.
     """
     names = {"config.yml", *(f"{FIELD_FOLDER}/{name}" for name in (MANIFEST_FILE, "queries.safetensors"))}
     try:
@@ -305,8 +307,8 @@ def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapp
         wanted = None if expected is None else expected.get(name)
         if digest is None or digest != wanted:
             raise InputError(
-                f"{folder / name} and its manifest are from different lifts: the file has digest {digest}, but the "
-                f"manifest has {wanted}; {LIFT_AGAIN}"
+                f"{folder / name} and its manifest are from different lifts: the digest of the file is "
+                f"{digest or 'missing'}, and that in the manifest is {wanted or 'missing'}; {LIFT_AGAIN}"
             )
 
 

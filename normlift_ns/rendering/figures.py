@@ -284,7 +284,7 @@ class FigureHeader:
     text: str
     """The prompt."""
     summary: str
-    """Size of the selection and strength of its evidence."""
+    """Size of the selection and strength of its evidence, or the statement that nothing is selected."""
     verdict: Verdict | None = None
     """Verdict on the presence of the prompt in the scene."""
 

@@ -85,8 +85,9 @@ def import_transformers() -> Any:
         return importlib.import_module("transformers")
     except ImportError as error:
         raise InputError(
-            f"--regions sam needs the package transformers ({summarize_error(error)}); install it with: "
-            'pip install "normlift-ns[sam]", or segment without SAM with --regions patches or --regions superpixel'
+            f"SAM needs the package transformers ({summarize_error(error)}); install it with: "
+            'pip install "normlift-ns[sam]". Without it, lift with --regions patches or superpixel, and query without '
+            "--segment"
         ) from None
 
 
@@ -94,20 +95,23 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
     """Return the network that the config.json of a folder describes.
 
     Raises:
-        ValueError: If config.json is missing or describes none of `kinds`, or if the installed torch or transformers is
-            too old for the network.
+        ValueError: If config.json is missing or describes none of `kinds`.
     """
     model_type = read_json(folder / CONFIG_FILE).get("model_type")
     kind = kinds.get(model_type) if isinstance(model_type, str) else None
     if kind is None:
         other = (TEXT_PROMPT_FAMILIES if kinds is POINT_PROMPT_FAMILIES else POINT_PROMPT_FAMILIES).get(str(model_type))
         prompts, regions = ("text prompts", "sam3") if kinds is POINT_PROMPT_FAMILIES else ("points", "sam")
-        hint = "" if other is None else f" ({other.name} takes {prompts}; use --regions {regions})"
+        hint = "" if other is None else f" ({other.name} takes {prompts}; use it with --regions {regions})"
         expected = ", ".join(f"{name!r}" for name in kinds)
         raise InputError(f"config.json has the model type {model_type!r:.60}{hint}, expected one of {expected}")
+    return kind
+
+
+def check_versions(kind: SamFamily) -> None:
+    """Raise InputError if the installed torch or transformers is too old for a network."""
     if kind is not SAM:
         weights.check_packages(kind.name, {"torch": _MIN_TORCH, "transformers": kind.min_transformers}, _ALTERNATIVE)
-    return kind
 
 
 def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
@@ -132,7 +136,8 @@ def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
         )
     missing = sorted(map(str, [*report["missing_keys"], *report["mismatched_keys"]]))
     if len(missing) > 0:
-        raise InputError(f"{WEIGHTS_FILE} lacks {len(missing)} parameters; the first is {missing[0]}")
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise InputError(f"in {WEIGHTS_FILE}, parameters are missing or have other shapes: {missing[0]}{more}")
     return model.eval().requires_grad_(False)
 
 
@@ -236,7 +241,7 @@ _NAMES = {
 
 
 def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT_PROMPT_FAMILIES) -> None:
-    """Check a checkpoint by name, without loading or downloading anything.
+    """Check the name of a checkpoint and the config.json of a local folder, without downloads and without weights.
 
     Raises:
         ValueError: If transformers is not installed, or too old for the network.
@@ -250,7 +255,8 @@ def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT
         weights.check_not_local(checkpoint, 2, f"{title} checkpoint", "neither a file nor a folder", remedy)
     elif (folder := transformers_folder(path)) is not None:
         with checkpoint_errors(path, title):
-            read_sam_family(folder, kinds)
+            kind = read_sam_family(folder, kinds)
+        check_versions(kind)
 
 
 def _title(kinds: Mapping[str, SamFamily]) -> str:
@@ -278,6 +284,8 @@ def load_sam_checkpoint(checkpoint: str) -> tuple[SamFamily, Any]:
     folder = transformers_folder(path)
     with checkpoint_errors(path):
         kind = SAM if folder is None else read_sam_family(folder, POINT_PROMPT_FAMILIES)
+    check_versions(kind)
+    with checkpoint_errors(path):
         return kind, _load_first_sam(path) if folder is None or kind is SAM else load_pretrained_sam(folder, kind)
 
 
@@ -338,8 +346,7 @@ def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
     files = _weight_files(folder)
     if len(files) == 0:
         raise InputError(f"the folder has no {WEIGHTS_FILE}")
-    config = read_json(folder / CONFIG_FILE)
-    check_config_sizes(config)
+    config = check_config_sizes(read_json(folder / CONFIG_FILE))
     return import_transformers().SamConfig.from_dict(config), _read_tensors(files[0])
 
 

@@ -99,7 +99,7 @@ def read_edge_weights(network: EdgeNetwork, content: bytes) -> None:
         InputError: If the file is not HDF5, an array is missing or has the wrong shape or type, or h5py is not
             installed.
     """
-    with third_party_errors("cannot read Keras files without h5py", "run: pip install h5py"):
+    with third_party_errors("the weights of --regions edges cannot be read without h5py", "run: pip install h5py"):
         import h5py  # noqa: PLC0415 (only these weights need it)
     remedy = f"download the file again with: {EDGES.command}"
     with third_party_errors("the weights of HED are damaged", remedy), h5py.File(io.BytesIO(content), "r") as file:
@@ -188,9 +188,9 @@ class EdgeRegions(RegionDefaults):
     """
 
     level: EdgeLevel = "m"
-    """Selected level: "s", "m" or "l", with about 300, 120 or 40 regions."""
+    """Selected level: "s", "m" or "l", with about 300, 120 or 40 regions. It has no effect if `count` is given."""
     count: int | None = None
-    """Number of regions, or None for the three levels."""
+    """Number of regions of a single level, or None for the three levels."""
     device: str = "cpu"
     """Device of the network."""
     pixels: int = WORKING_PIXELS

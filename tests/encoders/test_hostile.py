@@ -120,7 +120,7 @@ def test_bombs_programs_and_lossy_pictures_are_refused_by_name(tmp_path: Path) -
     path = tmp_path / "a.png"
     for side in (12_000, 20_000, 2**31 - 1):
         path.write_bytes(grey_png(side, side, 8, bytes(2**20)))
-        refused(lambda: LabelFiles(tmp_path, resample=True).labels(IMAGE, NAME), str(path))
+        refused(lambda: LabelFiles(tmp_path, resample=True).labels(IMAGE, NAME), str(path), "too large")
     path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 6\n%%EndComments\nshowpage\n")
     refused(lambda: read_image(path), str(path), "damaged or not an image")
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, NAME), "label map", str(path), "damaged or not an image")

@@ -226,7 +226,7 @@ def test_a_product_never_reads_outside_of_its_table() -> None:
         replace(rows, offsets=torch.tensor([0, 5, -3, 2])),
         replace(rows, weight=torch.ones(1)),
     ):
-        with pytest.raises(ValueError, match=r"must (be 0 or more|rise from 0)"):
+        with pytest.raises(ValueError, match=r"^(columns|row offsets) must "):
             broken.matmul(torch.ones(6, 1))
 
 

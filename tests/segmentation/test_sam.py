@@ -47,6 +47,16 @@ def test_a_folder_a_file_and_a_download_of_the_same_weights_agree(sam_weights, e
         assert set(found) == set(expected) and all(torch.equal(found[name], expected[name]) for name in found)
 
 
+def test_a_config_names_no_code(sam_weights, tmp_path):
+    """Keys that make transformers import or download code have no effect."""
+    config = copied(sam_weights / "tiny", tmp_path) / "config.json"
+    named = {"auto_map": {"AutoModel": "evil.M"}, "attn_implementation": "some/kernel", "_attn_implementation": "x/y"}
+    config.write_text(json.dumps(json.loads(config.read_text()) | named))
+    model = load_sam_checkpoint(str(tmp_path))[1]
+    assert model.config.to_dict().keys().isdisjoint(named)
+    assert model.config._attn_implementation in (None, "eager", "sdpa")
+
+
 def test_metas_files_fit(transformers):
     """Names and shapes of all parameters, without any weights."""
     for kind in ("vit_b", "vit_l", "vit_h"):
