@@ -251,8 +251,7 @@ def read_ply(path: Path) -> SplatFile:
     if vertex is None or vertex.count == 0:
         found = ", ".join(f"{element.count:,} {element.name}" for element in data.elements)[:200] or "nothing"
         raise InputError(
-            f"{path} has no Gaussians: expected vertices, found the elements {found}. Give the PLY file of a trained "
-            "splat."
+            f"{path} has no Gaussians (numbers of its elements: {found}). Give the PLY file of a trained splat."
         )
     mode = _mode([*data.comments, *vertex.comments])
     if any(item.name == PACKED for item in vertex.properties):
