@@ -12,8 +12,8 @@ from PIL import Image
 from plyfile import PlyData
 
 from normlift_ns import GaussianScene
-from normlift_ns.server.coloring import Codes
 from normlift_ns.server.permalink import PageView
+from normlift_ns.server.protocol import Codes
 from normlift_ns.server.runs import ServedRun, without_paths
 from normlift_ns.session.state import State
 from tests.server.pages import make_served
