@@ -358,7 +358,7 @@ def read_cloud(path: Path) -> PlyData:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is truncated or not a PLY file, or its vertices have no positions.
+        ValueError: The file is truncated or not a PLY file, or its vertices have list properties or no positions.
     """
     expected = "Expected a point cloud or mesh in PLY format whose vertices have x, y and z."
     if not path.is_file():
@@ -371,8 +371,9 @@ def read_cloud(path: Path) -> PlyData:
     vertex = next((element for element in cloud.elements if element.name == "vertex"), None)
     names = {} if vertex is None else {item.name: item for item in vertex.properties}
     if vertex is None or not set("xyz") <= set(names) or vertex.count == 0:
-        raise InputError(f"{path} has {0 if vertex is None else vertex.count:,} vertices with "
-                         f"{', '.join(names) or 'no properties'}. {expected}")  # fmt: skip
+        count = 0 if vertex is None else vertex.count
+        noun = "vertex" if count == 1 else "vertices"
+        raise InputError(f"{path} has {count:,} {noun} with {', '.join(names) or 'no properties'}. {expected}")
     lists = [name for name, item in names.items() if hasattr(item, "len_dtype")]
     if len(lists) > 0:
         raise InputError(f"{path} has vertices with list properties ({', '.join(lists)}); remove these. {expected}")

@@ -183,7 +183,10 @@ def new_names(options: Any, stored: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def names_of_0_2(options: Any) -> dict[str, Any]:
-    """Return options as a dictionary with the field names of version 0.2, which cache keys and manifests still use."""
+    """Return options as a dictionary with the names of version 0.2.
+
+    Keys of batches and the encoder entry of manifests still use these names.
+    """
     old_names = {new: old for old, new in getattr(options, "old_names", {}).items()}
     values = {old_names.get(field.name, field.name): getattr(options, field.name) for field in fields(options)}
     if values.get("encoder") == "color":

@@ -336,8 +336,8 @@ class RecordedVotes:
         store = self.field.store
         if isinstance(store, StoredEvidence) and store.evidence.num_views != len(names):
             raise InputError(
-                f"the run lists {len(names)} images, but its evidence is from {store.evidence.num_views}. Lift again "
-                "with: ns-normlift"
+                f"the run lists {len(names)} images, but has evidence from {store.evidence.num_views} images; lift "
+                "again with: ns-normlift"
             )
         return tuple(names)
 
@@ -393,10 +393,10 @@ class RecordedVotes:
 
     @property
     def disagreement(self) -> float:
-        """Usual disagreement of the views about a Gaussian, 1 - median ||f_j||.
+        """Usual disagreement of the views about a Gaussian, 1 minus the median norm of the mean features.
 
-        It is the mean of the values before and after the consensus, or the value after the consensus if the other one
-        is unknown.
+        It is the mean of the values before and after the consensus, or the value after the consensus if the value
+        before it is unknown.
         """
         scalars = self.field.scalars
         if not bool((scalars.norm > 0).any()):
@@ -442,7 +442,7 @@ class RecordedVotes:
 
     @cached_property
     def _source(self) -> FeatureSource:
-        """Return the feature source of the lift. Encoders and SAM only read the cache; they load no network."""
+        """Feature source of the lift. Encoders and SAM only read the cache; they load no network."""
 
         def is_quick(part: Any) -> bool:
             return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or hasattr(part, "checkpoint"))

@@ -2,8 +2,9 @@
 
 Two neighboring Gaussians get a count from each image in which both have a region. The count is 1 if both have the same
 region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s measures how much
-the views usually disagree. It is the mean of 1 - median ||f_j|| before and after the consensus. The affinity of two
-parts is the mean of the counts over all images and all pairs of neighbors across their border::
+the views usually disagree. It is the mean of 1 - median ||f_j|| before and after the consensus, with f_j the mean
+feature of Gaussian j. The affinity of two parts is the mean of the counts over all images and all pairs of neighbors
+across their border::
 
     a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
 

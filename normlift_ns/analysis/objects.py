@@ -242,7 +242,10 @@ def connected_components(
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """Class and object of every Gaussian. Classes are prompts; objects are connected components of a class."""
+    """Class and object of every Gaussian.
+
+    Classes are prompts, and objects are connected components of the Gaussians that a prompt selects.
+    """
 
     texts: tuple[str, ...]
     class_id: Int32[Tensor, " n"]

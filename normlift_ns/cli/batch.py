@@ -63,7 +63,7 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
     """Read a capture list, in its order.
 
     Args:
-        path: Text file. Each line has the path of a config.yml, a PLY file or a gsplat checkpoint. Options of
+        path: Text file. Each line has the path of a config.yml, a splat file or a gsplat checkpoint. Options of
             ns-normlift, quoted as in a shell, may follow the path or replace it. Empty lines and lines that start with
             # are ignored.
         options: Options of ns-normlift for all captures. The options of a line override them.
@@ -263,9 +263,9 @@ def _slurm_shard(environment: Mapping[str, str]) -> Shard:
     index, remainder = divmod(task - first, step)
     if remainder != 0 or not 0 <= index < count:
         raise InputError(
-            f"{_TASK_ID} is {task}, but the array must have {count} tasks from {first} on, without gaps. Submit "
-            "an array without gaps, such as sbatch -a 0-7, or give --shard none to let workers claim captures in a "
-            "shared folder."
+            f"{_TASK_ID} is {task}, which contradicts {_TASK_COUNT} ({count}) and {_TASK_MIN} ({first}) in an array "
+            "without gaps. Submit an array without gaps, such as sbatch -a 0-7, or give --shard none to let workers "
+            "claim captures in a shared folder."
         )
     return Shard(index, count)
 
@@ -520,7 +520,7 @@ class NormLiftBatch(CheckedOptions):
     """Folder for results, logs and claims, which all workers share. None: <name of the list>_batch next to the list."""
     shard: str = "auto"
     """Part of the list that this worker lifts. i/n: the i-th of n parts. none: all captures that no other worker has
-    claimed. auto: the part given by SLURM_ARRAY_TASK_ID, or by RANK and WORLD_SIZE, if they are set, else none."""
+    claimed. auto: the part that SLURM_ARRAY_TASK_ID, RANK and WORLD_SIZE define, if they are set, else none."""
     patience: float = 120.0
     """Take over another worker's capture after this many seconds without a heartbeat, in 1..86400. Use the same value
     for all workers. Larger values tolerate longer pauses but delay the takeover."""

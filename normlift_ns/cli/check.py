@@ -98,7 +98,7 @@ class NormLiftCheck(NormLift):
             return rows, None
         if len(missing) > 0:
             source = make_source(SourceOptions(encoder="color"), device)
-            stand_in = "without these weights, the plan describes a lift with --encoder color"
+            stand_in = "without the missing weights, the plan describes a lift with --encoder color"
             advice = "add the time of the networks, or fetch the weights and check again"
             rows.append(Diagnostic("plan", "warning", stand_in, advice))
         return rows, self._plan_opened(rows, opened, source, device)

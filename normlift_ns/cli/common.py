@@ -332,7 +332,7 @@ def _exit_code(command: type[CommandProtocol], words: list[str]) -> int:
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_USER_ERROR
     except (KeyboardInterrupt, TerminatedError) as stop:
         word, number = "Interrupted" if isinstance(stop, KeyboardInterrupt) else "Terminated", _SIGNALS[type(stop)]
-        print_error(f"{word}. No partial files remain; rerun the command to resume.")
+        print_error(f"{word}. No partial files remain; rerun the command.")
         return 128 + number
     except Exception as error:  # print a message instead of a traceback
         return _report_error(error)

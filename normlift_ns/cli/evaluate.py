@@ -45,7 +45,7 @@ class NormLiftEval(CheckedOptions):
     output_path: Path = Path("output.json")
     """JSON file to write."""
     overwrite: bool = False
-    """Replace an existing output file and the figures next to it."""
+    """Replace an existing output file, and files of studies next to it."""
     refined: bool = True
     """Evaluate the directions after the vote. False: evaluate the directions before the vote."""
     study: tuple[Literal["ablation", "sweeps", "signals", "timing", "baselines", "coverage"], ...] = ()
@@ -142,8 +142,8 @@ class NormLiftEval(CheckedOptions):
             self._check_without_truth()
         elif runs == 0 or runs != len(self.labels):
             raise InputError(
-                f"got {runs} runs and {len(self.labels)} --labels; give one --labels path for each run, in the same "
-                "order"
+                f"--load-config and --labels must have the same number of paths, at least one, got {runs} and "
+                f"{len(self.labels)}; give one --labels path for each run, in the same order"
             )
         if runs > 1 and (self.protocol == "masks" or self.data is not None):
             raise InputError("--protocol masks and --data accept only one run; give one path with --load-config")

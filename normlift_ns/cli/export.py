@@ -141,7 +141,7 @@ class NormLiftExport(options.CheckedOptions):
 
         if self.select == "clean":
             floaters = run.floaters(self.floater_threshold).mask
-            common.info(f"{int(floaters.sum()):,} likely floaters are left out")
+            common.info(f"Likely floaters that are left out: {int(floaters.sum()):,}")
             return ~floaters
         if answer is None or self.select == "scene":
             return torch.ones(len(run.field), dtype=torch.bool)

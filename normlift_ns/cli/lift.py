@@ -329,7 +329,8 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     if statistics["excluded"] > 0:
         table.add_row("not rendered", f"{statistics['excluded']:,} with non-finite or out-of-range parameters")
     if statistics["left_out"] > 0:
-        table.add_row("left out", f"{statistics['left_out']} images without features")
+        count = statistics["left_out"]
+        table.add_row("left out", f"{count} image{'s' * (count != 1)} without features")
     features = manifest["features"]
     kind = features["kind"] if "kind" in features else features["regions"]["kind"]
     table.add_row("2D features", kind)
@@ -399,6 +400,8 @@ def describe_consensus(agreement: float, least: float, kind: str) -> str:
     'agreement 0.30, which does not exceed the limit 0.40, so features stay unchanged'
     >>> describe_consensus(0.3, 0.4, "files").split("; ")[1]
     'if the regions are rough masks of objects, try --consensus-min-agreement 0'
+    >>> describe_consensus(0.0, 0.0, "sam")
+    'agreement 0.00, which does not exceed the limit 0.00, so features stay unchanged'
     """
     from normlift_ns.core.consensus import AGREEMENT_RAMP  # noqa: PLC0415 (torch is loaded by now)
 

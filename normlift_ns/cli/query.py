@@ -107,8 +107,8 @@ class NormLiftQuery(CheckedOptions):
     """List the objects in the selection, which are connected groups of at least 20 Gaussians. The column id is the
     instance_id in exports, and text is the prompt of the object. centroid is the mean position, weighted by evidence.
     box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z. Both span the
-    1st to 99th percentile. R is the mean reliability. views counts the training images in which the visible area of the
-    object is at least a tenth of its largest. best views names up to three of them: those with the whole object first,
+    1st to 99th percentile. R is the mean reliability. views counts the training images that show the object with at
+    least a tenth of its largest visible area. best views names up to three of them: those with the whole object first,
     and larger views before smaller ones. If there are more than 40 objects, the table lists only the 10 largest, and a
     line below counts the objects of each prompt."""
     objects_dir: Path | None = None
@@ -126,8 +126,8 @@ class NormLiftQuery(CheckedOptions):
     embeddings, or else the words of the encoder: 1,000 classes for imagenet, and the names of colors for color. Other
     encoders have no words, so objects are only numbered."""
     image: Path | None = None
-    """PNG file for --inventory, with the outlines and numbers of the objects in the training image that shows the most
-    objects."""
+    """PNG file for --inventory: a render with the outlines, numbers and names of the objects. The camera is that of the
+    training image that shows the most objects."""
     overwrite: bool = False
     """Replace existing files of the same names."""
     data: Path | None = None
@@ -378,7 +378,8 @@ class NormLiftQuery(CheckedOptions):
             raise InputError(f"{flags[0]} and {flags[1]} cannot be combined; leave one of them out")
         for name in ("save_query", "explain", "explain_dir", "segment", "objects", *_OUTPUTS):
             if flags != ["--text"] and getattr(self, name) and not (self.inventory and name == "output_json"):
-                raise InputError(f"--{name.replace('_', '-')} works only with --text; remove it or {flags[0]}")
+                flag = name.replace("_", "-")
+                raise InputError(f"--{flag} works only with --text; remove it, or give --text instead of {flags[0]}")
         self._check_dependent_options()
         if self.interactive and not sys.stdin.isatty():
             raise InputError(
@@ -520,7 +521,9 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         sys.stdout.write(json.dumps(output) + "\n")
         sys.stdout.flush()
     if failed > 0:
-        raise InputError(f"{failed} of {total} prompts have no answer; their JSON lines give the reasons under `error`")
+        raise InputError(
+            f"prompts without an answer: {failed} of {total}; their JSON lines give the reasons under the key error"
+        )
 
 
 def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: bool) -> None:

@@ -60,9 +60,9 @@ class LerfOptions(CheckedOptions):
 
     masking: Masking = "background"
     """Conversion of scores to masks. background selects pixels whose score exceeds that of every background word by
-    more than --margin. auto uses a threshold from the histogram of the scores in the image, as Splat Feature Solver
-    (SFS) does. langsplat thresholds LERF's relevancy of composited features, normalized per pixel, as in LangSplat.
-    langsplat_composited computes this relevancy from composited scores instead."""
+    more than --margin. auto applies the threshold of Splat Feature Solver, from the histogram of an image's scores and
+    the true number of objects. langsplat thresholds LERF's relevancy of composited features, normalized per pixel, as
+    in LangSplat. langsplat_composited computes this relevancy from composited scores instead."""
     margin: float = MASK_MARGIN
     """Lead over the best background word for --masking background, in cosine. Larger values give smaller masks. The
     code of Splat Feature Solver uses 0."""
@@ -74,7 +74,7 @@ class LerfOptions(CheckedOptions):
     Pixels at the image border are lost. The paper does not specify this step."""
     scale: Literal["unit", "norm"] = "unit"
     """Scores to composite. unit composites cosines. norm composites cosines times ||f||, the norm of the mean feature,
-    as in SFS, which does not normalize features."""
+    as in Splat Feature Solver, which does not normalize features."""
 
 
 @dataclass(frozen=True)

@@ -216,7 +216,7 @@ class NormLiftModel(SplatfactoModel):
         return outputs, image[:, :, 4:]
 
     def _composited(self, view: Camera, values: Tensor, rows: Tensor | None) -> Tensor:
-        """Return sum_j A_ij values_j, [H, W, C], with the rasterizer settings of the lift."""
+        """Composite values [N, C] with the rasterizer settings of the lift, and return them as [H, W, C]."""
         values, mode = values if rows is None else values[rows], self.config.rasterize_mode
         return render(self._scene(rows), view, values, rasterize_mode=mode, settings=self._settings)[0]
 

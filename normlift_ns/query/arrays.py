@@ -28,7 +28,7 @@ from normlift_ns.query.question import make_query
 from normlift_ns.query.text_encoder import text_encoder_for, with_text_source
 
 _DIRECTION_BLOCK = 8 * PROMPT_BLOCK
-"""Number of prompts that share one conversion of the float16 directions. It takes most of the time of a query."""
+"""Number of prompts that share one conversion of the float16 directions, which takes most of the time of a query."""
 _BLOCK_ELEMENTS = 2**21
 """Number of elements to convert to float32 at a time, so that they fit into a processor's cache."""
 

@@ -91,7 +91,7 @@ class Answer:
     question: Query
     field: SemanticField
     means: Float[Tensor, "n 3"]
-    """Centers of the Gaussians, in scene units."""
+    """Centers of the Gaussians, in scene units unless `run_query` received other units."""
     relevancy: Float[Tensor, "n q"]
     valid: Bool[Tensor, " n"]
     """True for Gaussians that have a direction."""
@@ -165,8 +165,8 @@ class Answer:
 class Finding:
     """Result of a query for one prompt.
 
-    Positions are in scene units. The centroid, the extent and the mean reliability are None if no Gaussian is selected.
-    Means are weighted by W_j, the total weight of Gaussian j over all views.
+    Positions are in the units of `Answer.means`. The centroid, the extent and the mean reliability are None if no
+    Gaussian is selected. Means are weighted by W_j, the total weight of Gaussian j over all views.
 
     >>> import torch
     >>> from normlift_ns import Evidence, SemanticField, lift
@@ -299,8 +299,8 @@ class Finding:
 class SelectionStats(NamedTuple):
     """Summary numbers of selected Gaussians.
 
-    Positions are in scene units. Means are weighted by W_j, the total weight of Gaussian j over all views. All numbers
-    except the fraction are None if no Gaussian is selected.
+    Positions are in the units of the centers. Means are weighted by W_j, the total weight of Gaussian j over all views.
+    All numbers except the fraction are None if no Gaussian is selected.
     """
 
     fraction: float

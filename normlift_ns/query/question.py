@@ -268,8 +268,8 @@ def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
     """Check the metadata and the arrays of embeddings, and return the query that they contain.
 
     Raises:
-        ValueError: The metadata or an embedding is not valid, both are inconsistent, or they do not match the field in
-            the folder.
+        ValueError: The metadata or an embedding is not valid, they contradict each other, or they do not match the
+            field in the folder.
     """
     metadata = msgspec.json.decode(encoded, type=_Metadata)
     if not math.isfinite(metadata.threshold):

@@ -392,7 +392,7 @@ def show_layer(state: State, name: str, *, visible: bool) -> State:
 
 
 def remove_layer(state: State, name: str) -> State:
-    """Remove a layer, and show its Gaussians again."""
+    """Remove a layer. If it was hidden, its Gaussians are drawn again, unless they are hidden otherwise."""
     layer = find_layer(state, name)
     return replace(state, layers=tuple(one for one in state.layers if one is not layer), action=f"Remove layer {name}")
 

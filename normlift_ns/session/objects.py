@@ -66,7 +66,7 @@ class ObjectList:
     left_out: int
     """Number of objects that are not listed because there are too many."""
     in_smaller_parts: int
-    """Number of Gaussians in components too small to be objects."""
+    """Number of Gaussians in components too small to be objects, counted separately for each prompt."""
 
 
 def list_objects(state: State, *, max_objects: int = 12, min_gaussians: int = OBJECT_MIN_GAUSSIANS) -> ObjectList:

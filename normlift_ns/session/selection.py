@@ -27,7 +27,7 @@ _CACHED_ANSWERS = 4
 _MAX_SAMPLES = 4096
 """Maximum number of directions to average."""
 _FRACTIONS = 11
-"""Number of shrinking steps plus one, so that the last step does not remove all Gaussians."""
+"""Maximum number of shrinking steps plus one, so that the last step does not remove all Gaussians."""
 _COSINE_STEP = 0.05
 """Decrease of the minimum cosine per step of growth."""
 

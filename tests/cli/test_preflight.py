@@ -151,7 +151,7 @@ EVAL = [
     ("--protocol masks --labels room --purity nan", "--purity must be in 0..1, got nan"),
     ("--protocol masks --labels room --names none", "none, given with --names"),
     ("--protocol masks --labels room --output-path file/x", "--output-path is"),
-    ("--protocol masks --labels room room", "1 runs", "2 --labels"),
+    ("--protocol masks --labels room room", "got 1 and 2", "--labels"),
     ("--protocol none", "protocol none", "--labels", "--study coverage"),
     ("--protocol none --study coverage --labels .", "protocol none", "--study coverage"),
 ]

@@ -2,17 +2,20 @@
 
 import gzip
 import io
+import re
 import struct
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from plyfile import PlyData
 
 from normlift_ns import GaussianScene
 from normlift_ns.server.permalink import PageView
 from normlift_ns.server.protocol import Codes
 from normlift_ns.server.runs import ServedRun, without_paths
+from normlift_ns.session.state import State
 from tests.server.pages import make_served
 from tests.session.worlds import BLOCK, world
 from tests.viewer.scenes import camera, scene_of, spheres
@@ -33,6 +36,15 @@ def test_the_faintest_and_smallest_of_too_many_are_left_out(tmp_path):
     visible = int((found.opacities >= 1 / 255).sum())
     assert few.describe(read_only=False)["num_left_out"] == visible - 50
     assert len(served.rows) == visible
+
+
+def test_the_message_of_a_download_counts_the_gaussians_in_the_file(tmp_path):
+    found = gaussians()
+    found.opacities[:3] = 1e-4
+    served = make_served(tmp_path, scene_of(found, cameras=(camera(),)), world())
+    _, content, text = served.export(State(served.space), torch.ones(len(found), dtype=torch.bool), "all", "ply")
+    written, left_out = (int(x) for x in re.search(r"Gaussians: (\d+)\. Left out.*: (\d+)\.", text).groups())
+    assert written == PlyData.read(io.BytesIO(content))["vertex"].count and written + left_out == len(found)
 
 
 def test_the_geometry_holds_the_rows_in_their_order(tmp_path):

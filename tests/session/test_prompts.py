@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from normlift_ns.errors import InputError
 from normlift_ns.query.question import join_prompts, split_prompts
+from normlift_ns.session.outputs import store_query
 from normlift_ns.session.prompts import (
     MAX_PROMPTS,
     Prompt,
@@ -98,3 +99,6 @@ def test_saving_keeps_what_is_saved():
     for other in (posed("red", negatives=["green"]), posed("red", negatives=(), refined=False)):
         with pytest.raises(InputError, match=f"{other.rule} and cosine"):
             merge_queries(one, other)
+    for folder, query, reason in ((None, one, "not stored"), (None, None, "no query")):
+        with pytest.raises(InputError, match=reason):
+            store_query(folder, query)
