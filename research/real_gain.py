@@ -135,8 +135,8 @@ class Observed:
         source, forms = {form: everyone.clone() for form in gate.LATER}, list(gate.LATER)
         turned = dict.fromkeys(forms, 0.0)
         for rows, part in zip(everyone.split(CHUNK[device.type]), parts(lifted, voters, cosines=True), strict=True):
-            near = [gate.neighbor_views(self.views.evidence, x) for x in part.group.split(2**12)]
-            near = tuple(torch.cat(x) for x in zip(*near))
+            together, both = zip(*(gate.neighbor_views(self.views.evidence, x) for x in part.group.split(2**12)))
+            near = torch.cat(together), torch.cat(both)
             for form in forms:
                 found = gate.decided(part, gate.gate_of(form, cosines), [form], self.labeled[rows], near)
                 place, cosine = found[0]

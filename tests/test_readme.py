@@ -39,7 +39,7 @@ OTHERS |= {
     "--white_background",
     "--xml",
 }
-OTHERS |= {"--pose_opt", "--rendered-output-names", "--clip", "--scenes", "--texts", "--viewer", "--xml"}
+OTHERS |= {"--pose_opt", "--rendered-output-names", "--clip", "--scenes", "--texts", "--later", "--viewer"}
 OTHERS |= {"--no-python", "--nnodes", "--nproc-per-node", "--rdzv-backend", "--rdzv-endpoint"}  # torchrun
 OTHERS |= {"--keep-crs", "--torch-backend"}  # OpenSplat, uv
 """Of other programs: pip, uv, ns-train, gsplat's trainer, our benchmarks, and so on."""
