@@ -43,7 +43,7 @@ def test_the_null_level_is_the_kth_largest_cosine_and_is_stored(count, k, tmp_pa
 def test_a_field_without_null_level_does_not_take_rule_contrast():
     lifted, means, source = example(0)
     field = SemanticField.build(lifted, means, source)
-    with pytest.raises(InputError, match=r"contrast.*null level"):
+    with pytest.raises(InputError, match=r"contrast.*unrelated words"):
         run_query(field, means, Query(("a",), unit_rows(1, D, 3).float().numpy(), rule="contrast"))
 
 
