@@ -31,9 +31,11 @@ def null_words() -> tuple[str, ...]:
 
 
 def null_vectors(source: FeatureSource, encoder: Mapping[str, Any]) -> Float[Tensor, "m d"] | None:
-    """Return the vectors of the null vocabulary of a lift, or None if the lift has no null vocabulary.
+    """Return the vectors of the null vocabulary of a lift.
 
-    The vocabulary of precomputed or imported features consists of the texts that were supplied with them.
+    The vocabulary consists of the prompts that were supplied with precomputed features or in a file of text embeddings.
+    For other lifts, it is `null_words`. The result is None if the vocabulary has fewer than five words, or the encoder
+    cannot embed them.
 
     Args:
         encoder: Encoder settings from the manifest.
