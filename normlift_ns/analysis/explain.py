@@ -120,6 +120,15 @@ class Why:
         votes = [vote for vote in self.views if vote.disagreement > 0]
         return tuple(sorted(votes, key=lambda vote: -vote.disagreement))
 
+    def images_to_show(self, count: int = 3) -> tuple[tuple[ViewVote, ...], tuple[ViewVote, ...]]:
+        """Return the images with the largest weight, and others that disagree, at most `count` of each.
+
+        An image disagrees if its vote has a cosine below 0.9 to the sum of all votes.
+        """
+        heaviest = self.views[:count]
+        others = [one for one in self.most_different if one.agreement < _MIN_AGREEMENT and one not in heaviest]
+        return heaviest, tuple(others[:count])
+
     @property
     def words(self) -> str:
         """Agreement of the images and their effective number, as English sentences.
@@ -147,6 +156,7 @@ class Why:
         return {**asdict(self), "words": self.words}
 
 
+_MIN_AGREEMENT = 0.9
 _COMPARED = 4096
 """Largest number of Gaussians whose directions before and after the vote are compared."""
 _LEVELS = (

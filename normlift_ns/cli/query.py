@@ -537,7 +537,11 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
 def print_answer(
     rows: list[dict[str, Any]], question: Query, coordinates: Literal["scene", "capture"] = "scene"
 ) -> None:
-    """Print the table of an answer, and a note for each prompt that has no clear match or is encoded only in part."""
+    """Print the table of an answer, and notes on prompts that need one.
+
+    They are prompts without a clear match, prompts that are encoded only in part, and those that select at least twice
+    as many Gaussians as at the suggested threshold.
+    """
     rule = f"{question.rule} > {question.threshold:.4g}"
     narrow = common.CONSOLE.width < 100
     common.CONSOLE.print(answer_table(rows, rule, question.threshold, coordinates, narrow=narrow))
@@ -548,6 +552,23 @@ def print_answer(
             position = "" if row["nearest"] is None else f", near {common.format_number(row['nearest'])}"
             peak = common.format_number(row["peak"])
             common.info(f"{row['text']}: {row['verdict']}. The largest relevancy is {peak}{position}.")
+    loose = [row["text"] for row in rows if _is_loose(row, question.threshold)]
+    if len(loose) > 0:
+        common.info(f"If too much is selected by {', '.join(loose)}, add --threshold auto to use the suggestion.")
+
+
+def _is_loose(row: dict[str, Any], threshold: float) -> bool:
+    """Return True if a prompt selects at least twice as many Gaussians as at its suggested threshold."""
+    if row["histogram"] is None:
+        return False
+    counts, low, high = (row["histogram"][name] for name in ("counts", "low", "high"))
+    width = (high - low) / len(counts)
+    centers = [low + (index + 0.5) * width for index in range(len(counts))]
+    selected, left = (
+        sum(count for count, center in zip(counts, centers) if center > least)
+        for least in (threshold, row["suggested_threshold"])
+    )
+    return selected >= 2 * max(1, left)
 
 
 def answer_table(
@@ -654,8 +675,6 @@ def _catalog_table(
 # ns-normlift-query --explain: the images that voted for a selection.
 
 
-IMAGES_PER_GROUP = 3
-"""Maximum number of images per prompt in each of two groups: the largest weights, and the largest disagreements."""
 _LARGEST_WEIGHT = "weighs most"
 
 
@@ -666,8 +685,8 @@ def explanation_to_json(names: Sequence[str], why: Why) -> dict[str, Any]:
 
 
 def _votes_to_show(why: Why) -> dict[str, tuple[ViewVote, ...]]:
-    """Return the votes of the images with the largest weight, and of those that disagree most, by group."""
-    return {_LARGEST_WEIGHT: why.views[:IMAGES_PER_GROUP], "disagrees most": why.most_different[:IMAGES_PER_GROUP]}
+    """Return the votes of the images with the largest weight, and of others that disagree, by group."""
+    return dict(zip((_LARGEST_WEIGHT, "disagrees"), why.images_to_show()))
 
 
 def save_vote_images(
@@ -705,6 +724,8 @@ def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequ
         common.CONSOLE.print(result)
     for text, why in zip(texts, reasons):
         common.info(f"{text}: {'nothing is selected, so nothing can be explained.' if why is None else why.sentence}")
+    if any(why is not None for why in reasons):
+        common.info("Images can agree on a wrong answer; the outlined regions show what they agree on.")
 
 
 def explanation_table(

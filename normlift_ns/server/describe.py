@@ -25,10 +25,6 @@ from normlift_ns.session.state import State
 
 MAX_OBJECTS = 24
 _MAX_HISTOGRAMS = 8
-_MAX_IMAGES = 3
-"""Maximum number of images with the largest weight, and of images with the largest disagreement, in an explanation."""
-_MIN_DISAGREEMENT = 0.1
-"""Minimum disagreement of the images that an explanation shows as disagreeing."""
 _IMAGE_SIZE = 480
 _CHANGED = "; the vote of neighboring Gaussians changed {:.0%} of the directions"
 
@@ -159,11 +155,7 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
     with served.analyzing:
         votes = served.run.votes
         why = votes.explain(state.selection.cpu(), refined=state.refined)
-        support = why.views[:_MAX_IMAGES]
-        different = [
-            vote for vote in why.most_different if vote not in support and vote.disagreement >= _MIN_DISAGREEMENT
-        ]
-        groups = {"support": support, "disagreement": different[:_MAX_IMAGES]}
+        groups = dict(zip(("support", "disagreement"), why.images_to_show()))
         images, problem = {}, None
         try:
             for picture in votes.pictures(dict.fromkeys(vote for group in groups.values() for vote in group)):

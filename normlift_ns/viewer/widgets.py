@@ -332,8 +332,6 @@ def _image(media_type: str, content: bytes) -> str:
 # Explanation of a selection for a panel: training images that voted for it, and images that disagree most.
 
 
-MAX_EXPLAIN_IMAGES = 3
-"""Maximum number of images with the largest weight, and of images with the largest disagreement, in an explanation."""
 _BUSY = "Finding supporting images …"
 _explain_lock = Lock()
 """Lock for reading and caching votes, so that no two threads do it at the same time."""
@@ -349,7 +347,7 @@ def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refin
         FileNotFoundError: An image that is needed to count the votes is missing.
     """
     why = votes.explain(selected.cpu(), refined=refined)
-    heaviest, different = why.views[:MAX_EXPLAIN_IMAGES], why.most_different[:MAX_EXPLAIN_IMAGES]
+    heaviest, different = why.images_to_show()
     images, problem = {}, ""
     try:
         for picture in votes.pictures(dict.fromkeys((*heaviest, *different))):
@@ -357,7 +355,7 @@ def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refin
     except (InputError, OSError) as error:
         problem = f"The images cannot be shown: {error}"
     lines = [escape_mdx(why.sentence), *filter(None, [escape_mdx(clip_text(problem, 400))])]
-    for title, view_votes in (("Strongest support:", heaviest), ("Most disagreement:", different)):
+    for title, view_votes in (("Strongest support:", heaviest), ("Images that disagree:", different)):
         if len(view_votes) > 0:
             lines += [f"**{title}**", *_list_votes(view_votes, votes.names, images)]
     return "\n\n".join(lines)

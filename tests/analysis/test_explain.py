@@ -50,6 +50,10 @@ def test_votes_are_the_sums_that_the_module_says(seed, share, copies):
     unit = torch.nn.functional.normalize(torch.as_tensor(dense) @ torch.as_tensor(table), dim=1).numpy()
     cosine = (unit[rows] * unit[np.flatnonzero(selected)]).sum(1)[rows != np.flatnonzero(selected)]
     assert abs(cosine - 0.98).min(initial=1) < 1e-6 or why.changed == (cosine < 0.98).sum() / why.gaussians
+    heaviest, others = why.images_to_show(2)
+    assert heaviest == why.views[:2] and set(others) == {x for x in why.views[2:] if x in others}
+    assert all(one.agreement < 0.9 for one in others)
+    assert len(others) == min(2, sum(one.agreement < 0.9 for one in why.views[2:]))
     assert why.copied == (rows != np.flatnonzero(selected)).sum()
     if weight.sum() == 0:
         assert why.views == ()
