@@ -276,7 +276,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({"colmap": "p"}, "folder .*p/images"),
         ({"colmap": "p", "images": "half"}, "half .*13 of 14,"),
         ({"colmap": "p", "images": "flat"}, "160 x 60 .* aspect"),
-        ({"colmap": "empty", "images": "half"}, "0 cameras and 0"),
+        ({"colmap": "empty", "images": "half"}, "cameras: 0, registered images: 0"),
         ({**every, "test_every": 1}, "test_every must be at least 2"),
         ({**every, "test_every": 8, "eval_images": ("0001",)}, "test-every and --eval-images"),
         ({**every, "eval_images": ("1.5",)}, r"1\.5 .* between 0 and 1"),
@@ -284,7 +284,7 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         ({**every, "eval_images": ("cat",)}, "--eval-images .*cat"),
         ({**every, "masks": "masks"}, r"masks has no mask for .*0000\.png"),
         ({"transforms": "t.json"}, "--colmap"),
-        (every, "0 points"),
+        (every, r"too few points \(0,"),
     ):
         with pytest.raises((nl.InputError, FileNotFoundError), match=message):
             nl.open_splat(path, nl.SplatOptions(**options))
@@ -339,7 +339,7 @@ def test_coordinates_of_a_utm_zone_are_named_with_an_offset(splat, frames, given
                 nl.open_splat(path, replace(given, colmap=project))
                 continue
             what = "The cameras of .*" if name == "here.ply" else r"far\.ply"
-            with pytest.raises(nl.InputError, match=rf"{what}: .*float32 is 0\.5 there.*500000 5200000 3") as caught:
+            with pytest.raises(nl.InputError, match=rf"{what}: .*float32 is 0\.5.*500000 5200000 3") as caught:
                 nl.open_splat(path, replace(given, colmap=project))
             assert "printf '1 0 0 -500000\\n0 1 0 -5200000\\n" in str(caught.value)
     (tmp_path / "offset.txt").write_text(f"1 0 0 {-shift[0]}\n0 1 0 {-shift[1]}\n0 0 1 {-shift[2]}\n0 0 0 1\n")
