@@ -339,7 +339,7 @@ def test_coordinates_of_a_utm_zone_are_named_with_an_offset(splat, frames, given
                 nl.open_splat(path, replace(given, colmap=project))
                 continue
             what = "The cameras of .*" if name == "here.ply" else r"far\.ply"
-            with pytest.raises(nl.InputError, match=rf"{what}: .*float32 is 0\.5, .*500000 5200000 3") as caught:
+            with pytest.raises(nl.InputError, match=rf"{what}: .*float32 is 0\.5.*500000 5200000 3") as caught:
                 nl.open_splat(path, replace(given, colmap=project))
             assert "printf '1 0 0 -500000\\n0 1 0 -5200000\\n" in str(caught.value)
     (tmp_path / "offset.txt").write_text(f"1 0 0 {-shift[0]}\n0 1 0 {-shift[1]}\n0 0 1 {-shift[2]}\n0 0 0 1\n")
