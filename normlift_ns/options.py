@@ -502,11 +502,12 @@ class SourceOptions:
     regions: str = "auto"
     """Image regions, each of which gets one feature. sam: masks of SAM. sam3: masks of SAM 3 for the prompts of
     --queries. edges: regions bounded by edges from a small network; fetch its weights with ns-normlift-weights --get
-    edges. patches: patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label maps from
-    --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise, auto depends on the encoder. For
-    a neural network on a GPU, auto selects the first of sam, edges and patches that this machine and the network
-    support. On a CPU, it never selects sam, and it prefers patches to edges for encoders that encode crops. In all
-    other cases, auto selects superpixel. Any other name: a mask source from an installed plugin."""
+    edges. patches: patches of a vision transformer. superpixel: pixels of similar color and position. grid: squares.
+    files: label maps from --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise, auto
+    depends on the encoder. For a neural network on a GPU, auto selects the first of sam, edges and patches that this
+    machine and the network support. On a CPU, it never selects sam, and it prefers patches to edges for encoders that
+    encode crops. In all other cases, auto selects superpixel. Any other name: a mask source from an installed
+    plugin."""
     sam3_prompts: tuple[str, ...] = ()
     """Prompts for the masks of --regions sam3. If there are none, SAM 3 uses the prompts of --queries."""
     region_count: int | None = None

@@ -29,7 +29,6 @@ from tempfile import TemporaryDirectory
 from time import process_time
 
 import numpy as np
-import torch
 from PIL import Image
 from scipy.ndimage import maximum_filter
 from skimage.segmentation import slic
