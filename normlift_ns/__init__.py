@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from normlift_ns.options import SplatOptions as SplatOptions
     from normlift_ns.query.engine import Answer as Answer
     from normlift_ns.query.engine import Finding as Finding
-    from normlift_ns.query.engine import Histogram as Histogram
+    from normlift_ns.query.histograms import Histogram as Histogram
     from normlift_ns.rasterization.rasterize import Contributors as Contributors
     from normlift_ns.rasterization.rasterize import contributors as contributors
     from normlift_ns.rasterization.rasterize import rasterize_evidence as rasterize_evidence
@@ -74,7 +74,8 @@ _HOMES = {
     "evaluation.studies": "refine_variant",
     "lifted_run": "LiftedRun open_run",
     "options": "BACKGROUND_WORDS CANONICAL_NEGATIVES LiftOptions RefineConfig SourceOptions SplatOptions",
-    "query.engine": "Answer Finding Histogram",
+    "query.engine": "Answer Finding",
+    "query.histograms": "Histogram",
     "rasterization.rasterize": "Contributors contributors rasterize_evidence render",
     "rasterization.settings": "RasterSettings",
     "server.client": "RemoteRun connect",

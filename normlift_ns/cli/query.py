@@ -563,7 +563,7 @@ def answer_table(
     """
     from rich.table import Table  # noqa: PLC0415 (--help needs no tables)
 
-    from normlift_ns.query.engine import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
+    from normlift_ns.query.histograms import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
 
     result = Table(title=f"Selected: {rule}; positions in {coordinates} coordinates", padding=(0, 0 if narrow else 1))
     wrapped = ("text", "centroid", "extent")

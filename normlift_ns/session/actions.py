@@ -13,7 +13,8 @@ from torch import Tensor
 
 from normlift_ns.errors import InputError
 from normlift_ns.options import WEAK_RELIABILITY
-from normlift_ns.query.engine import Finding, Histogram
+from normlift_ns.query.engine import Finding
+from normlift_ns.query.histograms import Histogram
 from normlift_ns.query.question import Query, join_prompts
 from normlift_ns.rendering.colors import RGB, clip_text, prompt_rgb_tuples
 from normlift_ns.session.prompts import Prompt, is_click

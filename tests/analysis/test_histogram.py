@@ -11,7 +11,7 @@ from normlift_ns import InputError, SemanticField
 from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.encoders.registry import EncoderKind
 from normlift_ns.query import engine
-from normlift_ns.query.engine import (
+from normlift_ns.query.histograms import (
     HISTOGRAM_BINS,
     draw_histogram,
     relevancy_histogram,

@@ -8,7 +8,6 @@ import pytest
 from normlift_ns import SemanticField
 from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query
-from normlift_ns.query.summaries import summarize
 from tests.io.test_field import D, example
 from tests.random_scenes import unit_rows
 
@@ -21,7 +20,7 @@ def test_summaries_equal_those_of_one_prompt(threshold: float, monkeypatch: pyte
     answer = run_query(field, means, question)
     answer = replace(answer, verdicts=("probably not here", "found", None, "weak match", "probably not here"))
     monkeypatch.setattr("normlift_ns.query.summaries._BLOCK_ELEMENTS", 2 * len(means))  # three blocks
-    for found, finding in zip(summarize(answer), answer, strict=True):
+    for found, finding in zip(answer._summarize(), answer, strict=True):
         ours, theirs = flat(found), flat(finding.to_json())
         numbers = {key: value for key, value in theirs.items() if isinstance(value, float)}
         assert {key: ours[key] for key in numbers} == pytest.approx(numbers, rel=1e-12, abs=1e-12)
