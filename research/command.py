@@ -11,8 +11,7 @@ ones with every stage cached (median of 3). The error of a new text is that of i
 What the file holds of the other kind of machine stays.
 
 With --before: lifts by colors with empty caches of kernels and bytecode, with those filled (cache of features empty),
-with every stage cached, and, if numba is installed, on two cores without the GPU; with every stage cached, also of
-patches; --render-dir with one prompt and three views, and with five prompts and all views; a thousand names of colors,
+with every stage cached, and, if numba is installed, on two cores without the GPU; --render-dir with one prompt and three views, and with five prompts and all views; a thousand names of colors,
 vectors given, in a warm process on the GPU, and on two cores; if their weights are here, edges with ImageNet's
 classifier. --quick measures the other checkout once, and leaves out its slowest cases.
 """
@@ -244,11 +243,6 @@ def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: 
     slow = ("now",) if quick else ("now", "before")
     for name in slow if gpu else ():
         prompts(name, "cuda", configs[name])
-    if gpu:
-        flags = ("--regions", "patches", *make_weights(folder, ["fox"]))
-        lift("now", "first_patches", "patches", *flags)
-        for _ in range(repeats["now"]):
-            lift("now", "cached_patches", "patches", *flags)
     if EDGES.is_here:
         for turn in range(repeats["now"] if gpu else 1):
             lift("now", "edges", f"edges{turn}", "--regions", "edges", "--encoder", "imagenet")
