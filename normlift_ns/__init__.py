@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from normlift_ns.analysis.explain import Why as Why
     from normlift_ns.analysis.objects import Floaters as Floaters
-    from normlift_ns.api import lift_run as lift_run
     from normlift_ns.core.consensus import Consensus as Consensus
     from normlift_ns.core.consensus import consensus as consensus
     from normlift_ns.core.evidence import Evidence as Evidence
@@ -40,9 +39,10 @@ if TYPE_CHECKING:
     from normlift_ns.options import RefineConfig as RefineConfig
     from normlift_ns.options import SourceOptions as SourceOptions
     from normlift_ns.options import SplatOptions as SplatOptions
+    from normlift_ns.pipeline import lift_run as lift_run
     from normlift_ns.query.engine import Answer as Answer
     from normlift_ns.query.engine import Finding as Finding
-    from normlift_ns.query.histograms import Histogram as Histogram
+    from normlift_ns.query.threshold import Histogram as Histogram
     from normlift_ns.rasterization.rasterize import Contributors as Contributors
     from normlift_ns.rasterization.rasterize import contributors as contributors
     from normlift_ns.rasterization.rasterize import rasterize_evidence as rasterize_evidence
@@ -52,12 +52,11 @@ if TYPE_CHECKING:
     from normlift_ns.server.client import connect as connect
 
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _HOMES = {
     "analysis.explain": "Why",
     "analysis.objects": "Floaters",
-    "api": "lift_run",
     "core.consensus": "Consensus consensus",
     "core.evidence": "Evidence",
     "core.field": "SemanticField",
@@ -74,8 +73,9 @@ _HOMES = {
     "evaluation.studies": "refine_variant",
     "lifted_run": "LiftedRun open_run",
     "options": "BACKGROUND_WORDS CANONICAL_NEGATIVES LiftOptions RefineConfig SourceOptions SplatOptions",
+    "pipeline": "lift_run",
     "query.engine": "Answer Finding",
-    "query.histograms": "Histogram",
+    "query.threshold": "Histogram",
     "rasterization.rasterize": "Contributors contributors rasterize_evidence render",
     "rasterization.settings": "RasterSettings",
     "server.client": "RemoteRun connect",

@@ -18,8 +18,8 @@ class InputError(ValueError):
     """Error for an invalid file or argument.
 
     The message names the file or argument, what was found, what was expected and what to do. Missing files raise
-    `FileNotFoundError` instead, and files that cannot be written raise `OSError`. All other exceptions are internal
-    errors.
+    `FileNotFoundError` instead, files that cannot be written raise `OSError`, and full memory raises `MemoryError`.
+    `describe_error` lists all exceptions that are not internal errors.
 
     >>> from normlift_ns import InputError, LiftOptions
     >>> try:
@@ -79,7 +79,10 @@ def truncate_text(text: str, max_length: int = 40) -> str:
 
 
 def summarize_error(error: BaseException) -> str:
-    """Return the type and the first line of another package's error, cut to 300 characters, to quote in a message."""
+    """Return the type and the first line of another package's error, to quote in a message.
+
+    If the first line ends with a colon, the second line follows. Longer texts are cut after 300 characters.
+    """
     lines = [line.strip() for line in str(error).strip().splitlines()]
     lines = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
     text = " ".join([f"{type(error).__name__}:", *lines]) if len(lines) > 0 else type(error).__name__
@@ -93,7 +96,8 @@ EXIT_USER_ERROR, EXIT_INTERNAL_ERROR = 1, 70
 def describe_error(error: BaseException) -> tuple[str, int]:
     """Return the message for the user and the exit code of a command that fails with this error.
 
-    For internal errors, also write the traceback to a log file.
+    User errors are `InputError`, `OSError`, full memory, and a torch that was built for another NumPy. For all others,
+    which are internal errors, the traceback is also written to a log file, or printed if that fails.
 
     >>> describe_error(InputError("beta must be positive, got -1"))
     ('beta must be positive, got -1', 1)
@@ -115,7 +119,7 @@ def _user_message(error: BaseException) -> str | None:
         return f"{error.filename}: {error.strerror}" if named else error.strerror or str(error)
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
         own = str(error) if type(error) is MemoryError else ""
-        advice = "close other programs, or lift fewer or smaller views with --max-views or --lift-downscale"
+        advice = "close other programs; for a lift, use --max-views or --lift-downscale 2"
         return own or f"the memory is full; {advice}"
     if type(error).__name__ == "OutOfMemoryError":  # torch's class, without importing torch
         return f"the GPU's memory is full ({_first_line(error)}); use the CPU: --device cpu"
@@ -166,7 +170,7 @@ def _log_folders() -> list[Path]:
 
 
 def user_state_folder() -> Path | None:
-    """Return the user's folder for program state, which may not exist yet; None for users without a home folder."""
+    """Return the user's folder for program state, which may not exist yet; None if it is unknown."""
     state = Path(os.environ.get("XDG_STATE_HOME", ""))
     with suppress(RuntimeError):
         return (state if state.is_absolute() else Path.home() / ".local" / "state") / "normlift_ns"

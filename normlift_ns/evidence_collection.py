@@ -202,8 +202,8 @@ class ViewBatch(NamedTuple):
 def chunk_views(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]:
     """Split views into chunks of at most 16; an interrupted lift loses the results of at most one chunk.
 
-    Every process gets the same number of chunks, and each chunk has one evidence file. The evidence of a view does not
-    depend on the other views in its chunk.
+    Every process gets the same number of chunks, if there are enough views. The evidence of a view does not depend on
+    the other views in its chunk.
 
     >>> [[len(chunk) for chunk in chunk_views(range(45), processes)] for processes in (1, 2)]
     [[15, 15, 15], [12, 12, 12, 9]]
@@ -215,7 +215,7 @@ def chunk_views(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]
 
 
 def sample_evenly(count: int, maximum: int | None) -> list[int]:
-    """Return at most `maximum` of `count` indices, evenly spaced, including the first and the last.
+    """Return at most `maximum` of `count` indices, evenly spaced, with the first and (if `maximum` > 1) the last.
 
     >>> sample_evenly(10, 4)
     [0, 3, 6, 9]
@@ -319,7 +319,8 @@ def batch_evidence(
     """Return the evidence of the regions in a block, from the evidence of cells.
 
     The folder caches the cell evidence of each view. The function reads a view from the cache if `reuse` is True and
-    its scene, camera and labels are the same. Its regions, its features and the other views of its block may differ.
+    its Gaussians, camera, labels and rasterization settings are the same. Its regions, its features and the other views
+    of its block may differ.
     """
     keys = evidence_keys(gaussians, block, config)
     cached = find_cached_views(folder, keys) if reuse else {}

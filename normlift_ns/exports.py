@@ -523,7 +523,7 @@ def _export_masks(job: ExportJob, folder: Path) -> list[str]:
 
 def _export_cloud(job: ExportJob, path: Path) -> list[str]:
     if job.transfer is None:
-        raise InputError("there is no point cloud to label; give one with --transfer")
+        raise InputError("the export has no point cloud to label; give one with --transfer")
     assert job.answer is not None and job.instances is not None
     cloud = (job.transfer, path)
     labeled = transfer_labels(job.scene, job.field, job.answer, job.instances, *cloud, overwrite=job.overwrite)

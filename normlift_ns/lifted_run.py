@@ -1,12 +1,14 @@
-"""Lifted runs: opening, queries, exports and renders."""
+"""Lifted runs: opening, queries, exports, renders, and writing after a lift."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,18 +34,37 @@ from normlift_ns.analysis.objects import (
 )
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import choose_device
-from normlift_ns.core.field import SemanticField
+from normlift_ns.core.field import SemanticField, fingerprint
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.lift import Scalars
 from normlift_ns.core.scene import Scene
-from normlift_ns.data.open_scene import open_stored_run
-from normlift_ns.encoders.text_files import LazyTextEncoder, check_template
+from normlift_ns.data.nerfstudio import config_classes
+from normlift_ns.data.nerfstudio.config import dump_config, set_dataset, skip_seed_points
+from normlift_ns.data.nerfstudio.load import NerfstudioScene
+from normlift_ns.data.open_scene import (
+    CHECKPOINT_DIR,
+    EXTRA_IMAGES_FILE,
+    TRANSFORMS_FILE,
+    SplatScene,
+    open_stored_run,
+    save_splat,
+    splatfacto_checkpoint,
+)
+from normlift_ns.data.transforms import write_transforms
+from normlift_ns.encoders.text_files import LazyTextEncoder, check_template, write_text_embeddings
 from normlift_ns.errors import InputError, MissingImageError
+from normlift_ns.io.atomic import atomic_file, commit_directory, draft_directory, numbered_paths, write_text_file
 from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.io.run_dir import (
     FIELD_FOLDER,
+    TEXT_EMBEDDINGS_FILE,
+    add_digest_comment,
     cache_folder,
+    complete_interrupted_lifts,
+    refuse_existing_run,
+    run_file_digests,
     text_cache_folder,
+    written_files,
 )
 from normlift_ns.options import (
     FLOATER_THRESHOLD,
@@ -145,7 +166,7 @@ class LiftedRun:
             min_reliability: Minimum reliability R of selected Gaussians, in 0..1.
             refined: Use the directions after the vote.
         Raises:
-            ValueError: There is no prompt, a prompt is empty, the encoder cannot encode a prompt, or a vector has
+            ValueError: No prompt is given, a prompt is empty, the encoder cannot encode a prompt, or a vector has
                 another number of values than the features.
 
         >>> from normlift_ns import open_run
@@ -607,3 +628,133 @@ def open_run(
     device, path = choose_device(device), check_path("load_config", load_config)
     folder, scene, stored = open_stored_run(path / "config.yml" if path.is_dir() else path, data)
     return LiftedRun(folder, scene, with_text_source(stored, text_embeddings=vectors, template=prompt_template), device)
+
+
+def write_run(
+    source: NerfstudioScene | SplatScene,
+    field: SemanticField,
+    run_dir: Path,
+    *,
+    question: Query | None = None,
+    text_embeddings: Mapping[str, Tensor] | None = None,
+    overwrite: bool = False,
+    exact_name: bool = True,
+) -> Path:
+    """Write a lifted run, completely or not at all, and return its directory.
+
+    The directory contains config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model,
+    without optimizers), dataparser_transforms.json, and the field in normlift/. A run lifted from a PLY file or gsplat
+    checkpoint also has its cameras in transforms.json, and the other settings that reopen it in splat.json.
+
+    Relative paths in the config of the source run stay relative. nerfstudio's own commands must therefore run in the
+    directory in which the source run was trained. The ns-normlift commands run in any directory.
+
+    Args:
+        run_dir: Directory from `run_directory`, output_dir/experiment/normlift/timestamp.
+        question: Query to store, which nerfstudio renders as relevancy_0, relevancy_1, …
+        text_embeddings: The user's own text embeddings, by prompt.
+        overwrite: Replace an existing directory.
+        exact_name: If False and `run_dir` exists, write to <name>_2, <name>_3, … instead.
+    Raises:
+        FileExistsError: The directory exists, `exact_name` is True and `overwrite` is False.
+        ValueError: The field was lifted from other Gaussians.
+        OSError: A file cannot be written, for instance because the disk is full. No files remain in that case.
+    """
+    complete_interrupted_lifts(run_dir)
+    if exact_name:
+        refuse_existing_run(run_dir, overwrite, source.checkpoint_path)
+    if field.manifest["means_fingerprint"] != fingerprint(source.gaussians.means):
+        raise InputError(
+            f"The semantic field of {len(field)} Gaussians was not lifted from the {len(source.gaussians)} Gaussians "
+            f"of {source.checkpoint_path}; lift that checkpoint again."
+        )
+    with draft_directory(run_dir) as folder:
+        if isinstance(source, SplatScene):
+            save_splat(folder, source)
+            transform, scale, checkpoint = torch.eye(4)[:3], 1.0, splatfacto_checkpoint(source)
+            config_in: Callable[[Path], config_classes.TrainerConfig] = partial(splat_config, source)
+        else:
+            if len(source.extra_frames) > 0:
+                write_transforms(folder / EXTRA_IMAGES_FILE, source.extra_frames, ())
+            transform, scale = source.dataparser_transform, source.dataparser_scale
+            model = {f"_model.{name}": tensor for name, tensor in source.checkpoint.model.items()}
+            checkpoint = {"step": source.checkpoint.step, "pipeline": model}
+            config_in = partial(_lifted_config, source)
+        facts = {"transform": transform.tolist(), "scale": scale}
+        write_text_file(folder / "dataparser_transforms.json", json.dumps(facts, indent=4))
+        stored = folder / CHECKPOINT_DIR / f"step-{checkpoint['step']:09d}.ckpt"
+        with atomic_file(stored) as draft:
+            torch.save(checkpoint, draft)
+        field_dir = folder / FIELD_FOLDER
+        if text_embeddings:
+            write_text_embeddings(field_dir / TEXT_EMBEDDINGS_FILE, text_embeddings)
+        files = [stored, field_dir / TEXT_EMBEDDINGS_FILE, *folder.glob("*.json")]
+        field.save(field_dir, beside=run_file_digests(field_dir, files), own=True)
+        if question is not None:
+            save_query(field_dir, question)
+        for path in (run_dir,) if exact_name else numbered_paths(run_dir):
+            write_text_file(
+                folder / "config.yml", add_digest_comment(dump_config(config_in(path))), overwrite=True, own=True
+            )
+            if commit_directory(folder, path, replaced=written_files if overwrite and exact_name else None):
+                return path
+    refuse_existing_run(run_dir, overwrite=False)  # another process created it meanwhile
+    raise FileExistsError(f"another process created and removed {run_dir} during the lift; run the lift again")
+
+
+def _lifted_config(source: NerfstudioScene, run_dir: Path) -> config_classes.TrainerConfig:
+    config, location = deepcopy(source.config), source.location
+    config.method_name = "normlift"
+    config.output_dir = location.relative_to_root(run_dir.parents[2])
+    config.timestamp = run_dir.name
+    config.relative_model_dir = Path(CHECKPOINT_DIR)
+    config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
+    config.pipeline.model = config_classes.NormLiftModelConfig(
+        **{**vars(source.model_config), "semantics": Path(FIELD_FOLDER)}
+    )
+    if location.data_moved or config.output_dir.is_absolute():
+        set_dataset(config, location.data)  # relative paths would not resolve to the dataset
+    skip_seed_points(config)
+    # "gpu" means the pipeline's device; "cpu" would pin memory, which needs CUDA
+    config.pipeline.datamanager.cache_images = "gpu"
+    return config
+
+
+def splat_config(scene: SplatScene, run_dir: Path) -> config_classes.TrainerConfig:
+    """Return a nerfstudio config for a run lifted from a PLY file or gsplat checkpoint, which has no config of its own.
+
+    With this config, nerfstudio loads the cameras in the run directory without transforming them. All paths except that
+    of the field are absolute, because the run has no training directory as a base for relative paths.
+    """
+    cameras = run_dir / TRANSFORMS_FILE
+    dataparser = config_classes.NerfstudioDataParserConfig(
+        data=cameras,
+        downscale_factor=1,
+        orientation_method="none",
+        center_method="none",
+        auto_scale_poses=False,
+        eval_mode="all",
+        load_3D_points=False,
+    )
+    model = config_classes.NormLiftModelConfig(
+        sh_degree=max(1, scene.splat.degree),
+        background_color=scene.background_name,
+        rasterize_mode=scene.rasterize_mode,
+        semantics=Path(FIELD_FOLDER),
+    )
+    datamanager = config_classes.FullImageDatamanagerConfig(
+        data=cameras,
+        dataparser=dataparser,
+        cache_images="gpu",  # means the pipeline's device; "cpu" would pin memory, which needs CUDA
+        cache_images_type="uint8",
+    )
+    return config_classes.TrainerConfig(
+        method_name="normlift",
+        experiment_name=scene.name,
+        output_dir=run_dir.parents[2],
+        timestamp=run_dir.name,
+        relative_model_dir=Path(CHECKPOINT_DIR),
+        data=cameras,
+        pipeline=config_classes.VanillaPipelineConfig(datamanager=datamanager, model=model),
+        vis="viewer",
+    )

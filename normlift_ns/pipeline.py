@@ -1,16 +1,16 @@
 """Pipeline from a trained scene and a source of 2D features to a semantic field. Read this module first.
 
-`lift_scene` runs the steps in order: features -> evidence -> consensus -> lift -> vote -> store. `api.run_lift` opens
-the scene before these steps and writes the run after them. Both use one process; `distributed.lift` runs the same steps
+`lift_run` opens a scene, lifts onto it and writes the lifted run. `lift_scene` runs the steps between in order:
+features -> evidence -> consensus -> lift -> vote -> store. Both use one process; `distributed.lift` runs the same steps
 in several processes.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
+from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.consensus import (
     CHANCE_AGREEMENT,
     SAMPLING_SEED,
@@ -30,27 +31,61 @@ from normlift_ns.core.consensus import (
     sample_gaussians,
     with_original_reliability,
 )
-from normlift_ns.core.device import load_triton
+from normlift_ns.core.device import choose_device, init_cuda, load_triton
 from normlift_ns.core.evidence import Entries, Evidence
 from normlift_ns.core.field import CHANGED_COSINE, SemanticField
-from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.gaussians import GaussianScene
-from normlift_ns.core.independence import independent_views, pair_reliability
 from normlift_ns.core.left_out import leave_views_out
-from normlift_ns.core.lift import Lifted, lift, norm_of_reliability
+from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.null_level import with_null_level
-from normlift_ns.core.refine import clamp_k, labeled_share, refine, unsupported
+from normlift_ns.core.refine import (
+    clamp_k,
+    labeled_share,
+    refine,
+    relative_gate,
+    sample_pairs,
+    shared_region_cosines,
+    unsupported,
+)
+from normlift_ns.core.reliability import independent_views, norm_of_reliability, pair_reliability
 from normlift_ns.core.scene import Scene, camera_summary
-from normlift_ns.encoders.base import FeatureSource
+from normlift_ns.data.alignment import alignment_warning, measure_alignment
+from normlift_ns.data.nerfstudio.load import NerfstudioScene
+from normlift_ns.data.open_scene import SplatScene, open_scene, resolve_field_paths
+from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, precomputed_features
+from normlift_ns.encoders.build import make_source, source_settings
 from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
 from normlift_ns.encoders.null_words import null_vectors
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import EvidenceCollection, RasterConfig, ViewObservations, sample_evenly
-from normlift_ns.options import LiftOptions
+from normlift_ns.io.memory import refuse_small_memory
+from normlift_ns.io.run_dir import (
+    FIELD_FOLDER,
+    TEXT_EMBEDDINGS_FILE,
+    cache_folder,
+    complete_interrupted_lifts,
+    refuse_existing_run,
+    run_directory,
+)
+from normlift_ns.lifted_run import LiftedRun, write_run
+from normlift_ns.options import (
+    CANONICAL_NEGATIVES,
+    LiftOptions,
+    SourceOptions,
+    check_bool,
+    check_path,
+    check_prompt_list,
+    renamed,
+)
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
+from normlift_ns.query.engine import run_query
+from normlift_ns.query.question import Query, make_query
+from normlift_ns.query.text_encoder import encoder_settings, precomputed_settings
 from normlift_ns.rasterization.gsplat import resolve_gsplat_rules
 from normlift_ns.rasterization.rasterize import resolve_backend
+from normlift_ns.rasterization.settings import RasterSettings
+from normlift_ns.segmentation.registry import describe_choice, resolve_source
 
 _MIN_LIFTED_SHARE = 0.01
 """Smallest share of Gaussians with a direction, in 0..1, for which `check_directions` does not warn."""
@@ -61,13 +96,278 @@ _COMPARED = 20_000
 _WARM_UP_GAUSSIANS, _WARM_UP_REGIONS = 4096, 4
 
 
+@renamed(check="check_alignment")
+@check_arguments
+def lift_run(
+    config_or_scene: str | Path | Scene,
+    *,
+    source: SourceOptions | None = None,
+    features: Sequence[tuple[Any, Any]] | Mapping[str, tuple[Any, Any]] | None = None,
+    texts: Mapping[str, Float[Tensor, " d"]] | None = None,
+    lift: LiftOptions | None = None,
+    queries: Sequence[str] = (),
+    data: str | Path | None = None,
+    load_step: int | None = None,
+    output_dir: str | Path | None = None,
+    timestamp: str | None = None,
+    overwrite: bool = False,
+    check_alignment: bool = True,
+    device: str = "auto",
+    export: FeatureExport | None = None,
+    report: ProgressCallback = lambda stage, done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> LiftedRun:
+    """Lift 2D features onto the Gaussians of a trained run, and write a lifted run next to it.
+
+    The new run is outputs/<experiment>/normlift/<timestamp>. ns-viewer, ns-render and the ns-normlift commands open it.
+
+    Args:
+        config_or_scene: config.yml of the trained run, or a scene from `open_scene` or `open_splat`.
+        source: Options of the 2D features to compute from the images. If None, use the defaults of ns-normlift.
+        features: Your own features, instead of `source`. Each training image has a pair of a label map [H, W] and
+            vectors [R, D]. The label map has the size of the undistorted image, before or after `lift_downscale`. Its
+            values are regions 0..R-1, or -1 for no region. Pass a list with one pair per training image, or a
+            dictionary by image name, which may omit images.
+        texts: Vector [D] of each prompt, for your own features. The run stores the vectors for later queries.
+        lift: Options of the lift. If None, use the defaults.
+        queries: Prompts to store in the run; ns-render and ns-viewer show their relevancy.
+        data: As in `open_scene`; allowed only with a config.
+        load_step: As in `open_scene`; allowed only with a config.
+        output_dir: Output folder, instead of the outputs folder of the trained run.
+        timestamp: Name of the new run directory. If None, use the current time, with a number if such a run exists.
+        overwrite: Replace an existing run directory of that name. For exported files, see `FeatureExport.overwrite`.
+        check_alignment: Compare a few training images with renders of the scene before the lift. Warn if they differ,
+            and raise if they do not show the same scene.
+        device: Device to lift on: auto, cpu or cuda.
+        export: Folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
+        report: Progress callback, called with (stage, steps done, total steps).
+        say: Callback for status lines and warnings, such as `print`.
+    Raises:
+        FileExistsError: The run directory exists and `overwrite` is False.
+        FileNotFoundError, ValueError: As in `open_scene`; also if an image, a label map or an option is not valid.
+        MemoryError: The lift does not fit into GPU memory.
+        TypeError: `config_or_scene` is neither a config nor a scene from `open_scene` or `open_splat`.
+
+    >>> scene = open_scene(config)
+    >>> import torch
+    >>> left = [(torch.arange(160).expand(120, 160) // 80, torch.eye(2)) for _ in scene.train.names]
+    >>> run = lift_run(scene, features=left, texts={"left": torch.tensor([1.0, 0.0])}, output_dir=folder)
+    >>> 0.1 < run.ask("left")["left"].fraction < 0.8
+    True
+    """
+    if not isinstance(config_or_scene, str | Path) and (data is not None or load_step is not None):
+        raise InputError("data and load_step apply to a config only; pass them to open_scene")
+
+    def opened() -> Scene:
+        if isinstance(config_or_scene, str | Path):
+            return open_scene(config_or_scene, data=data, load_step=load_step)
+        return config_or_scene
+
+    request = LiftRequest(
+        open_scene=opened, source=source, features=features, texts=texts,
+        lift=lift, queries=queries, output_dir=output_dir, timestamp=timestamp, overwrite=overwrite,
+        check_alignment=check_alignment, device=device, export=export, report=report, say=say,
+    )  # fmt: skip
+    return run_lift(request)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiftRequest:
+    """Request to lift features onto a trained scene and to write the lifted run; see `normlift_ns.lift_run`."""
+
+    open_scene: Callable[[], Scene]
+    """Function that opens the trained scene, called after all checks that do not need the scene."""
+    source: SourceOptions | None = None
+    features: Sequence[tuple[Any, Any]] | Mapping[str, tuple[Any, Any]] | None = None
+    texts: Mapping[str, Float[Tensor, " d"]] | None = None
+    lift: LiftOptions | None = None
+    queries: Sequence[str] = ()
+    output_dir: str | Path | None = None
+    timestamp: str | None = None
+    overwrite: bool = False
+    check_alignment: bool = True
+    device: str = "auto"
+    export: FeatureExport | None = None
+    report: ProgressCallback = lambda stage, done, total: None
+    say: Callable[[str], None] = lambda text: None
+
+    def __post_init__(self) -> None:
+        if self.features is None and self.texts is not None:
+            raise InputError("texts apply to your own features only; pass features as well, or omit texts")
+        if self.features is not None and self.source is not None:
+            raise InputError("got both features and source; pass only one of them, because features replace source")
+        check_prompt_list("queries", self.queries)
+        check_bool("check_alignment", self.check_alignment)
+        check_bool("overwrite", self.overwrite)
+        if self.output_dir is not None:
+            check_path("output_dir", self.output_dir)
+        if self.timestamp is not None:
+            run_directory(Path(), "run", self.timestamp)  # raises for an invalid name before the scene loads
+        for name, kind in (("source", SourceOptions), ("lift", LiftOptions), ("export", FeatureExport)):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise InputError(f"{name} must be {kind.__name__}, got {type(value).__name__}")
+
+
+@dataclass(frozen=True)
+class PreparedLift:
+    """Lift with an open scene and checked inputs."""
+
+    request: LiftRequest
+    scene: NerfstudioScene | SplatScene
+    source: FeatureSource
+    options: SourceOptions
+    lift: LiftOptions
+    device: str
+    run_dir: Path
+    texts: Mapping[str, Float[Tensor, " d"]] | None
+    """The user's own text embeddings by prompt; None if the encoder embeds prompts."""
+    encoder: Mapping[str, Any]
+    """Options of the text encoder that matches the features."""
+
+
+def run_lift(request: LiftRequest) -> LiftedRun:
+    """Lift features onto a trained scene, write the lifted run, and return it."""
+    prepared, stages = prepare_lift(request), StageTimer(request.report)
+    scene, cache, device = prepared.scene, cache_folder(prepared.run_dir), prepared.device
+    cameras = scene.train.cameras
+    refuse_small_memory(len(scene.gaussians), max((c.width * c.height for c in cameras), default=0))
+    check_target(prepared)
+    announce(prepared)
+    collection = plan_collection(scene, prepared.source, prepared.lift, cache, device=device, export=request.export)
+    kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
+    check_alignment(prepared, stages, kernels.wait_for_rendering)  # while the other kernels are compiled
+    result = lift_collection(collection, kernels, device=device, encoder=prepared.encoder, report=request.report)
+    return write_lifted_run(prepared, result, stages)
+
+
+def prepare_lift(request: LiftRequest) -> PreparedLift:
+    """Load encoders, open the scene and choose the run directory, without writing any file."""
+    device, options = choose_device(request.device), (request.source or SourceOptions()).looking_for(request.queries)
+    init_cuda(device)
+    source = None
+    if request.features is None:
+        options = resolve_source(options, device)
+        source = make_source(options, device)  # raises before the scene loads
+    if source is not None and len(request.queries) > 0:
+        source.text(request.queries)
+    scene = request.open_scene()
+    if not isinstance(scene, NerfstudioScene | SplatScene):
+        raise TypeError(
+            "lift_run takes the config.yml of a run, or a scene from open_scene or open_splat; got "
+            f"{type(scene).__name__}"
+        )
+    if request.export is not None:
+        check_unique_stems(scene.train.names)
+    if source is None:
+        source = precomputed_features(request.features, request.texts, scene.train.names)
+        if len(request.queries) > 0:
+            source.text(request.queries)
+    folder = scene.runs_dir if request.output_dir is None else check_path("output_dir", request.output_dir)
+    run_dir = run_directory(folder, scene.name, request.timestamp)
+    texts = source.texts if isinstance(source, PrecomputedFeatures) else None
+    own = precomputed_settings(TEXT_EMBEDDINGS_FILE if texts else None)
+    encoder = encoder_settings(options) if request.features is None else own
+    lift = request.lift or LiftOptions()
+    return PreparedLift(request, scene, source, options, lift, device, run_dir, texts, encoder)
+
+
+def check_target(prepared: PreparedLift) -> None:
+    """Complete file writes that earlier lifts left unfinished; raise if the run exists and must not be replaced."""
+    complete_interrupted_lifts(prepared.run_dir)
+    if prepared.request.timestamp is not None:
+        refuse_existing_run(prepared.run_dir, prepared.request.overwrite, prepared.scene.checkpoint_path)
+
+
+def announce(prepared: PreparedLift) -> None:
+    """Report the size of the lift, the automatic choice of 2D features, and the warnings about the scene."""
+    request, scene, most, say = prepared.request, prepared.scene, prepared.lift.max_views, prepared.request.say
+    used = "" if most is None else f"{min(most, len(scene.train))} of "
+    say(f"{len(scene.gaussians):,} Gaussians, {used}{len(scene.train)} training views, on {prepared.device}")
+    if request.features is None:
+        choice = describe_choice(request.source or SourceOptions(), prepared.device)
+        if choice is not None:
+            say(choice)
+    for remark in scene.remarks:
+        say(f"Warning: {remark}")
+
+
+def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str | None:
+    """Compare renders with training images; return a warning if they differ, or raise if they show different scenes."""
+    settings = RasterSettings.recorded({**scene.identity, "gsplat_rules": resolve_gsplat_version(scene, options)})
+    measured_with = RasterSettings.recorded(scene.identity)
+    match = scene.alignment if isinstance(scene, SplatScene) and settings == measured_with else None
+    match = match or measure_alignment(scene, settings, device=device)
+    return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
+
+
+def check_alignment(prepared: PreparedLift, stages: StageTimer, wait_for_rendering: Callable[[], None]) -> None:
+    """Report the warning of `compare_with_images`, unless the request disables the comparison.
+
+    Args:
+        wait_for_rendering: Function that waits until the kernels for renders are compiled.
+    """
+    if not prepared.request.check_alignment:
+        return
+    with stages("check") as step:
+        wait_for_rendering()
+        warning = compare_with_images(prepared.scene, prepared.lift, prepared.device)
+        step()
+    if warning is not None:
+        prepared.request.say(f"Warning: {warning}")
+
+
+def write_lifted_run(prepared: PreparedLift, result: LiftResult, stages: StageTimer) -> LiftedRun:
+    """Write the run of a finished lift, and return it."""
+    request, field = prepared.request, result.field
+    if request.features is None:
+        settings = source_settings(prepared.options, prepared.device)
+        field = replace(field, manifest={**field.manifest, "source": settings})
+    seconds = {**stages.seconds, **result.seconds}
+    with stages("write") as step:
+        question = query_to_store(field, prepared.scene.gaussians.means, prepared.source, request.queries)
+        run_dir = write_run(
+            prepared.scene, field, prepared.run_dir,
+            question=question, text_embeddings=prepared.texts, overwrite=request.overwrite,
+            exact_name=request.timestamp is not None,
+        )  # fmt: skip
+        field = field.to("cpu")
+        step()
+    seconds["write"] = stages.seconds["write"]
+    return LiftedRun(
+        run_dir, prepared.scene, resolve_field_paths(field, run_dir / FIELD_FOLDER), prepared.device, seconds
+    )
+
+
+def query_to_store(
+    field: SemanticField, means: Float[Tensor, "n 3"], source: FeatureSource, queries: Sequence[str]
+) -> Query | None:
+    """Return the query that a new run stores for these prompts; None without prompts.
+
+    Raises:
+        ValueError: The vectors of the prompts and the features have different dimensions.
+    """
+    if len(queries) == 0:
+        return None
+    length = source.text(queries).shape[1]
+    if length != field.dimension:
+        raise InputError(
+            f"the vectors of --queries have {length} numbers, but the features have {field.dimension}; give the model "
+            "of the features with --encoder-model and --encoder-pretrained, or give --text-embeddings"
+        )
+    negatives = None
+    if isinstance(source, PrecomputedFeatures):  # the file with these prompts does not exist yet
+        negatives = CANONICAL_NEGATIVES if set(CANONICAL_NEGATIVES) <= set(source.texts) else ()
+    return run_query(field, means, make_query(field, source.text, queries, negatives=negatives)).question
+
+
 class LiftResult(NamedTuple):
     """Semantic field of a lift, with the seconds of its stages."""
 
     field: SemanticField
     seconds: dict[str, float]
-    """Duration of each stage, in order: features, evidence, consensus and recognition (if enabled), lift, neighbors,
-    vote, store."""
+    """Duration of each stage, in order: features, evidence, consensus, recognition, lift, neighbors, vote, store.
+    Stages that the options disable are left out."""
 
 
 def lift_scene(
@@ -274,7 +574,7 @@ def with_stored_reliability(lifted: Lifted, means: Float[Tensor, "n 3"], collect
     kind, beta, scalars = collection.options.reliability, collection.options.reliability_beta, lifted.scalars
     if kind == "paper":
         return lifted
-    views, norm = scalars.n_eff.double(), norm_of_reliability(scalars, beta)
+    views, norm = scalars.n_eff.double(), norm_of_reliability(scalars.reliability, scalars.n_eff, beta)
     if kind == "angular":
         cameras = (collection.scene.train.cameras[index] for index in collection.views)
         centers = torch.stack([camera.world_to_camera.double().cpu().inverse()[:3, 3] for camera in cameras])

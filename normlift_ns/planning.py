@@ -23,7 +23,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns import evidence_collection, pipeline
-from normlift_ns.api import LiftRequest, compare_with_images
 from normlift_ns.core.consensus import consensus
 from normlift_ns.core.device import choose_device, init_cuda
 from normlift_ns.core.evidence import Evidence
@@ -255,8 +254,8 @@ def measure_core(
 ) -> tuple[dict[str, Rate], Rate]:
     """Measure the cost of each core stage of a lift in seconds, and of the storage in bytes.
 
-    The function repeats the evidence of a few views until it has as many views as the lift. A Gaussian of the sample
-    then has as many entries as in the lift. `Rate` explains the parts of a cost.
+    The function repeats the evidence of a few views until it has about as many views as the lift, but at most 64. The
+    cost of further views is extrapolated. `Rate` explains the parts of a cost.
 
     Args:
         evidence: Evidence of a few views.
@@ -356,7 +355,7 @@ def diagnose_views(scene: Scene) -> Diagnostic:
     for camera in scene.train.cameras:
         visible |= in_frustum(means, camera)
     share = float(visible.float().mean())
-    message = f"{share:.1%} of the Gaussians are in at least one of the {len(scene.train)} training views"
+    message = f"{share:.1%} of the Gaussians are in at least one training view (number of views: {len(scene.train)})"
     if share < _NONE_IN_VIEW:
         return Diagnostic("in view", "error", message, "give the cameras of this splat, or add --world-transform")
     if share < _FEW_IN_VIEW:
@@ -367,7 +366,7 @@ def diagnose_views(scene: Scene) -> Diagnostic:
 
 def diagnose_cameras(warning: str | None) -> Diagnostic:
     """Return the diagnostic for the warning of `compare_cameras`, which is None if images and renders match."""
-    match = "three images match renders from their cameras"
+    match = "the images that were checked match renders from their cameras"
     return Diagnostic("cameras", "ok" if warning is None else "warning", warning or match)
 
 
@@ -422,7 +421,7 @@ def diagnose_versions() -> Diagnostic:
         return Diagnostic("versions", "warning", message, "run pip install nerfstudio==1.1.5")
     if len(missing) > 0:
         message = f"{message}; not installed: {', '.join(missing)}"
-        return Diagnostic("versions", "error", message, f"run pip install {missing[0]}")
+        return Diagnostic("versions", "error", message, f"run pip install {' '.join(missing)}")
     return Diagnostic("versions", "ok", f"{message}, normlift_ns {_version('normlift-ns') or 'from source'}")
 
 
@@ -462,7 +461,7 @@ def diagnose_weights(missing: Sequence[str]) -> Diagnostic:
     """Check that all weights are on this machine."""
     if len(missing) == 0:
         return Diagnostic("weights", "ok", "all required weights are on this machine")
-    message = f"not on this machine: {'; '.join(missing)}. A lift downloads weights from the Hugging Face hub"
+    message = f"not on this machine: {'; '.join(missing)}. A lift downloads only those from the Hugging Face hub"
     return Diagnostic(
         "weights",
         "warning",
@@ -528,7 +527,7 @@ class _Observed(NamedTuple):
 
 
 def time_kernel_loading(scene: Scene, options: LiftOptions, *, device: str = "cpu") -> float:
-    """Load or compile the kernels of a lift; return the seconds that the next process needs to load them."""
+    """Load or compile the kernels of a lift; return an estimate of the seconds that the next process needs for this."""
     gaussians = scene.gaussians.to(device)
     config = pipeline.choose_raster_config(scene, gaussians, options)
     kernels = pipeline.start_kernel_warm_up(scene, gaussians, options, config)
@@ -689,7 +688,7 @@ class OpenedCapture(NamedTuple):
     stage_seconds: dict[str, float]
 
 
-def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
+def open_capture(request: pipeline.LiftRequest, start_time: float) -> OpenedCapture:
     """Open the capture of a request, and record the seconds of the stages `start` and `open`.
 
     Args:
@@ -702,10 +701,10 @@ def open_capture(request: LiftRequest, start_time: float) -> OpenedCapture:
 
 
 def compare_cameras(opened: OpenedCapture, options: LiftOptions, device: str) -> str | None:
-    """Return a warning if images and renders of three views differ; record the seconds of `kernels` and `check`."""
+    """Return a warning if images and renders of some views differ; record the seconds of `kernels` and `check`."""
     opened.stage_seconds["kernels"] = time_kernel_loading(opened.scene, options, device=device)
     start = perf_counter()
-    warning = compare_with_images(opened.scene, options, device)
+    warning = pipeline.compare_with_images(opened.scene, options, device)
     opened.stage_seconds["check"] = perf_counter() - start
     return warning
 
@@ -719,7 +718,7 @@ def plan_opened(
     return make_plan(facts, num_devices=num_devices)
 
 
-def dry_run(request: LiftRequest, num_devices: int, start_time: float) -> Plan:
+def dry_run(request: pipeline.LiftRequest, num_devices: int, start_time: float) -> Plan:
     """Estimate the time, memory and disk space of a lift without running it.
 
     Args:

@@ -44,8 +44,8 @@ class Registry(Generic[Plugin]):
         """Import and return the plugin with this name.
 
         Raises:
-            InputError: The name is unknown, two packages register it, or the plugin of another package cannot be
-                loaded.
+            InputError: The name is unknown, two packages register it, or its entry point cannot be loaded or is not a
+                plugin of this type.
         """
         point = self._find(name)
         advice = f"such as {self.flag} {self.default}"
@@ -100,4 +100,4 @@ def _entry_points(group: str, path: tuple[str, ...]) -> Sequence[EntryPoint]:
 
 
 def _package(point: EntryPoint) -> str:
-    return f"package {point.dist.name}" if point.dist is not None else "an unnamed package"
+    return f"package {'normlift_ns' if point.dist is None else point.dist.name}"  # built-in plugins have no `dist`

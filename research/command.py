@@ -11,9 +11,10 @@ ones with every stage cached (median of 3). The error of a new text is that of i
 What the file holds of the other kind of machine stays.
 
 With --before: lifts by colors with empty caches of kernels and bytecode, with those filled (cache of features empty),
-with every stage cached, and, if numba is installed, on two cores without the GPU; --render-dir with one prompt and three views, and with five prompts and all views; a thousand names of colors,
-vectors given, in a warm process on the GPU, and on two cores; if their weights are here, edges with ImageNet's
-classifier. --quick measures the other checkout once, and leaves out its slowest cases.
+with every stage cached, and, if numba is installed, on two cores without the GPU; --render-dir with one prompt and
+three views, and with five prompts and all views; a thousand names of colors, vectors given, in a warm process on the
+GPU, and on two cores; if their weights are here, edges with ImageNet's classifier. --quick measures the other checkout
+once, and leaves out its slowest cases.
 """
 
 from __future__ import annotations

@@ -32,8 +32,8 @@ from normlift_ns import (
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.progress import peak_gib
 from normlift_ns.rasterization import numba as compiled
-from normlift_ns.rasterization.backend import RasterBatch, RasterJob
 from normlift_ns.rasterization.projection import assign_tiles
+from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
 from research.gpu_cases import grid_labels
 from research.report import RESULTS, Report, stopwatch
 from tests.captures import SHARED, trained_scene, training_cameras

@@ -3,8 +3,8 @@
     python -m research.gate --workers 12                all scenes; for a GPU
     python -m research.gate --quick                     a small room and three cells, for the tests
 
-Every form votes after the consensus with the posterior vote. Its gate is fixed (tau, gamma) or relative (`core.gate`).
-It may abstain, so that a Gaussian keeps its direction:
+Every form votes after the consensus with the posterior vote. Its gate is fixed (tau, gamma) or relative (see
+`core.refine.relative_gate`). It may abstain, so that a Gaussian keeps its direction:
 
 * delta: the winner must lead by this much, in units of R times views (equation 10);
 * quorum: neighbors of this share of the weight must agree with the winner; P g(1) is full agreement;
@@ -34,7 +34,7 @@ cells of 3 views with dropped masks the vote fills Gaussians whose things have n
 
 Reliabilities are measured in the same run, on the answers after the consensus: the area under the ROC curve of being
 right, the accuracy in tenths by R and the mean R of each tenth. Four forms: R of the paper (`paper`), R of the paper
-with N of `core.independence` (`views`), its R with N_eff (`pairs`), and its R (`angular`). Rule: the better form has
+with N of `core.reliability` (`views`), its R with N_eff (`pairs`), and its R (`angular`). Rule: the better form has
 the larger mean AUC over the cells of masks of tabletop and plain room, and is nowhere worse than the paper's by more
 than 0.01 in the mean of a damage or a number of views; otherwise the paper's stays the default.
 """
@@ -61,11 +61,10 @@ from normlift_ns.core.consensus import (
     sample_gaussians,
     total_view_weights,
 )
-from normlift_ns.core.gate import relative_gate, shared_region_cosines
-from normlift_ns.core.independence import independent_views, pair_reliability
 from normlift_ns.core.left_out import leave_views_out
-from normlift_ns.core.lift import reliability
 from normlift_ns.core.metrics import classify
+from normlift_ns.core.refine import relative_gate, shared_region_cosines
+from normlift_ns.core.reliability import independent_views, pair_reliability, reliability
 from research.batched_votes import CHUNK, Voters, mious, parts
 from research.candidates import Candidate
 from research.cells import SAMPLE, Place, Settings, Site

@@ -20,8 +20,8 @@ import torch
 from normlift_ns import Lifted, RefineConfig, SemanticField, lift, nearest_neighbors, rasterize_evidence, refine
 from normlift_ns.core.lowrank import StoredEvidence
 from normlift_ns.evaluation.baselines import dense_sums
-from normlift_ns.rasterization.backend import RasterJob
 from normlift_ns.rasterization.gsplat import project_views
+from normlift_ns.rasterization.rasterize import RasterJob
 from normlift_ns.rasterization.settings import RasterSettings
 from research.cpu import relative_difference
 from research.gpu_cases import DIMENSION, Case, capture_case, features, once, room_case, timed

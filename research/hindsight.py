@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from normlift_ns.core.relevancy import TOP_QUANTILE
-from normlift_ns.query.histograms import suggest_threshold
+from normlift_ns.query.threshold import suggest_threshold
 from research.cut import Asked, ask, best_cut
 from research.report import Report
 

@@ -37,8 +37,7 @@ from normlift_ns.encoders.base import RegionFeatures
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.encoders.registry import encoder_kind
 from normlift_ns.options import RefineConfig, RelevancyRule
-from normlift_ns.query.engine import Verdict, judge
-from normlift_ns.query.histograms import Histogram, relevancy_histogram
+from normlift_ns.query.threshold import Histogram, Verdict, judge, relevancy_histogram
 from normlift_ns.segmentation.regions import Grid, Superpixels
 from research.damage import LADDER, observe
 from research.report import RESULTS, Report

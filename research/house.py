@@ -20,7 +20,7 @@ MANY = 8
 """Parameters of a function, `self` and `cls` not counted; kernels and their launchers may have more."""
 KNOT = 15
 """Cyclomatic complexity above which a function is hard to follow."""
-KERNELS = ("normlift_ns.kernels", "normlift_ns.rasterization.numba_kernels")
+KERNELS = ("normlift_ns.kernels", "normlift_ns.rasterization.numba")
 ALIASES = ("normlift_ns.plugin.", "normlift_ns.scripts.")
 """Packages of modules for old paths, which hand on names of others."""
 BRANCHES = (ast.If, ast.IfExp, ast.For, ast.AsyncFor, ast.While, ast.ExceptHandler, ast.Assert, ast.comprehension)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import get_args
 
 import normlift_ns as nl
-from normlift_ns.query.engine import Verdict
+from normlift_ns.query.threshold import Verdict
 from research.null_words import LISTS
 from research.report import Report
 

@@ -47,10 +47,9 @@ from torch.nn.functional import normalize
 
 import normlift_ns as nl
 from normlift_ns.core.consensus import Overlaps, apply_consensus, region_overlaps, sample_gaussians, total_view_weights
-from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.neighbors import Neighbors
-from normlift_ns.core.refine import labeled_share
+from normlift_ns.core.refine import labeled_share, relative_gate, sample_pairs, shared_region_cosines
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.build import make_source
 from normlift_ns.errors import InputError

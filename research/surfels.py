@@ -21,7 +21,7 @@ from torch import Tensor
 from normlift_ns import Camera, GaussianScene, RasterSettings, lift, rasterize_evidence, render
 from normlift_ns.data.open_splat import open_splat
 from normlift_ns.kernels.compositing import AlphaLimits, composite
-from normlift_ns.rasterization.backend import RasterJob
+from normlift_ns.rasterization.rasterize import RasterJob
 from normlift_ns.rasterization.triton import project_and_bin
 from research.gpu_cases import CELL, Case, features, grid_labels, once
 from research.report import RESULTS, Report

@@ -16,7 +16,7 @@ from research.made_room import Part, Plan, built, look
 from research.synthetic_scenes import World, world_of_room
 
 LENGTH, WIDTH, HEIGHT = 4.2, 4.0, 2.5
-"""Of the floor in x and y, and of the walls, metres. There is no ceiling."""
+"""Of the floor in x and y, and of the walls, metres. It has no ceiling."""
 SEED = 23
 FIELD_OF_VIEW = 62.0
 """Horizontal, degrees."""

@@ -27,7 +27,6 @@ LAYERS = (
     ("exports",),
     ("session", "lifted_run"),
     ("pipeline",),
-    ("api",),
     ("planning", "viewer", "distributed"),
     ("nerfstudio_plugin",),
     ("method_configs", "plugin"),
@@ -46,7 +45,7 @@ TENSORS = {"torch", "jaxtyping"}
 FOREIGN = {
     **dict.fromkeys(("errors", "registry", "options", "plugin", "scripts"), frozenset()),
     **dict.fromkeys(("progress",), frozenset({"torch"})),
-    **dict.fromkeys(("api", "pipeline"), TENSORS),
+    **dict.fromkeys(("pipeline",), TENSORS),
     "io": BASE | {"xxhash", "msgspec"},
     "kernels": TENSORS | {"triton"},
     "core": BASE,
@@ -162,7 +161,7 @@ for command, words in mistakes:
     check(words, HEAVY)
 normlift_ns.lift, normlift_ns.render
 check("functions", HEAVY - {"torch", "numpy", "scipy"})
-import normlift_ns.api, normlift_ns.encoders.build as build
+import normlift_ns.pipeline, normlift_ns.encoders.build as build
 build.make_source(normlift_ns.SourceOptions(encoder="color")).text(["red"])
 check("colours", {"nerfstudio", "open_clip", "gsplat", "torchvision", "sympy", "torch._dynamo", "scipy.stats", "viser"})
 """

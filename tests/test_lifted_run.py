@@ -18,8 +18,7 @@ from normlift_ns.demo.room import DemoRoom
 from normlift_ns.evaluation.protocols import EvaluatedRun
 from normlift_ns.query.question import Query
 from normlift_ns.rasterization import rasterize
-from normlift_ns.rasterization.backend import RasterJob
-from normlift_ns.rasterization.rasterize import choose_backend
+from normlift_ns.rasterization.rasterize import RasterJob, choose_backend
 from tests.cli.conftest import run_entry, said
 
 

@@ -82,7 +82,7 @@ else:
 
 FLAT = """
 import torch, normlift_ns as nl
-from normlift_ns.core.lift import reliability
+from normlift_ns.core.reliability import reliability
 assert reliability(0.6, torch.tensor([2.0]), beta=1.0).allclose(torch.tensor(0.24))
 n, turn = 60, 3 * torch.rand(60)
 quats = torch.stack([turn.cos(), 0 * turn, 0 * turn, turn.sin()], 1)

@@ -30,8 +30,9 @@ from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.consensus import CHANCE_AGREEMENT, consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import CHANGED_COSINE, SemanticField
-from normlift_ns.core.lift import lift, norm_of_reliability
+from normlift_ns.core.lift import lift
 from normlift_ns.core.lowrank import StoredEvidence
+from normlift_ns.core.reliability import norm_of_reliability
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.base import FeatureSource
@@ -109,6 +110,9 @@ class Why:
     """R of the selection. This number, `norm`, `c_intra`, `c_inter` and `n_eff` treat the selection as one Gaussian."""
     views: tuple[ViewVote, ...]
     """Votes of the images with weight > 0, by descending weight."""
+    copied: int = 0
+    """Number of selected Gaussians that use the direction of another one. This value of version 0.2 will be removed.
+    Use `changed` instead."""
 
     @property
     def most_different(self) -> tuple[ViewVote, ...]:
@@ -187,7 +191,8 @@ def explain_selection(
     }
     table = features.to(joined.rows.weight.device)[joined.rows.column.long()].double()
     views = _votes(joined, torch.nn.functional.normalize(table, dim=1))
-    return Why(len(rows), _changed_share(evidence, features, rows, origin), **scalars, views=views)
+    copied = int((origin != rows).sum())
+    return Why(len(rows), _changed_share(evidence, features, rows, origin), **scalars, views=views, copied=copied)
 
 
 def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: Tensor) -> float:
@@ -396,7 +401,8 @@ class RecordedVotes:
             return 1.0
         norms = [scalars.norm.double()]
         if self._option("reliability", str, "paper") == "paper":
-            norms.append(norm_of_reliability(scalars, self._option("reliability_beta", float, 1.0)))
+            beta = self._option("reliability_beta", float, 1.0)
+            norms.append(norm_of_reliability(scalars.reliability, scalars.n_eff, beta))
         return 1 - sum(float(norm[norm > 0].median()) for norm in norms) / len(norms)
 
     def _cached_evidence(self, block: evidence_collection.ViewBatch) -> Evidence:

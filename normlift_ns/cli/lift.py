@@ -27,10 +27,10 @@ from normlift_ns.io.run_dir import cache_folder, refuse_existing_run, run_direct
 from normlift_ns.options import CheckedOptions, LiftOptions, SourceOptions, SplatOptions, check_device, renamed
 
 if TYPE_CHECKING:
-    from normlift_ns.api import LiftRequest
     from normlift_ns.core.scene import Scene
     from normlift_ns.distributed.communicator import TorchCommunicator
     from normlift_ns.lifted_run import LiftedRun
+    from normlift_ns.pipeline import LiftRequest
     from normlift_ns.planning import Plan
     from normlift_ns.progress import ProgressCallback
 
@@ -135,7 +135,7 @@ class NormLift(CheckedOptions):
         Args:
             more: Other fields of the request.
         """
-        from normlift_ns.api import LiftRequest  # noqa: PLC0415 (--help should not wait for torch)
+        from normlift_ns.pipeline import LiftRequest  # noqa: PLC0415 (--help should not wait for torch)
 
         own = {item.name: getattr(self, item.name) for item in fields(LiftRequest) if hasattr(self, item.name)}
         return LiftRequest(**own, **more)
@@ -152,8 +152,8 @@ class NormLift(CheckedOptions):
         start_time = common.command_start()
         keep_freed_memory()
         common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.api import run_lift  # noqa: PLC0415 (as above)
         from normlift_ns.encoders.langsplat import FeatureExport  # noqa: PLC0415
+        from normlift_ns.pipeline import run_lift  # noqa: PLC0415 (as above)
 
         import_time = time.perf_counter()
         message_times: list[float] = []

@@ -563,7 +563,7 @@ def answer_table(
     """
     from rich.table import Table  # noqa: PLC0415 (--help needs no tables)
 
-    from normlift_ns.query.histograms import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
+    from normlift_ns.query.threshold import draw_histogram  # noqa: PLC0415 (--help should not wait for NumPy)
 
     result = Table(title=f"Selected: {rule}; positions in {coordinates} coordinates", padding=(0, 0 if narrow else 1))
     wrapped = ("text", "centroid", "extent")
@@ -698,7 +698,7 @@ def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequ
     if result.row_count > 0:
         common.CONSOLE.print(result)
     for text, why in zip(texts, reasons):
-        common.info(f"{text}: {'nothing is selected, so there is no explanation.' if why is None else why.sentence}")
+        common.info(f"{text}: {'nothing is selected, so nothing can be explained.' if why is None else why.sentence}")
 
 
 def explanation_table(

@@ -119,7 +119,7 @@ def open_all(server: WarmServer) -> None:
     """Open the runs of a server, and start a thread that prepares the data of their first pages."""
     for name in server.runs.ids:
         server.runs.get(name)
-    threading.Thread(target=server.runs.warm_up, daemon=True).start()
+    threading.Thread(target=server.warm_up, daemon=True).start()
 
 
 def until_stopped() -> NoReturn:

@@ -1,8 +1,8 @@
 """Runtime checks of public functions' arguments against their annotations.
 
-`check_arguments` decorates every public function, dataclass and NamedTuple. Arguments that are annotated as tensors may
-also be NumPy arrays or nested lists of numbers, which are converted. This module imports torch only to convert an
-array.
+`check_arguments` decorates the functions, dataclasses and NamedTuples of the public API. Arguments that are annotated
+as tensors may also be NumPy arrays or nested lists of numbers, which are converted. This module imports torch only to
+convert such arguments.
 """
 
 from __future__ import annotations
@@ -87,8 +87,10 @@ def check_rows(name: str, rows: Any, size: int, low: int = 0) -> None:
         size: Number of rows.
         low: Smallest valid index, -1 if -1 marks a missing row.
     """
-    first, last = map(int, rows.aminmax()) if rows.numel() > 0 else (low, low)
-    if first < low or max(last, 0) >= max(size, 1):
+    if rows.numel() == 0:
+        return
+    first, last = map(int, rows.aminmax())
+    if first < low or last >= size:
         raise InputError(f"{name} must be in {low}..{size - 1}, got {first if first < low else last}")
 
 

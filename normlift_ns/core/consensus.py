@@ -2,8 +2,9 @@
 
 An error in a 2D feature affects its whole region in one view, so neighboring Gaussians share it. Regions of other views
 that cover the same Gaussians usually do not have this error. The consensus therefore moves each feature toward those of
-overlapping regions in other views. Let E be the evidence, and W_jv(s) the weight of Gaussian j in the view of region s,
-including pixels without a region. Sums run over the Gaussians that are visible in both views::
+overlapping regions in other views. Let E be the evidence, F_s the feature of region s, and W_jv(s) the weight of
+Gaussian j in the view of s, including pixels without a region. Let t be a region of another view v. Sums over j run
+over the Gaussians that are visible in both views::
 
     p_js = E_js / W_jv(s)                                        share of j that lies in s, 0 if below 0.02
     c_st = sum_j p_js p_jt / sum_j p_js                          share of s that lies in t
@@ -19,8 +20,9 @@ The factor c_ts limits the influence of a region t that covers several objects. 
 cells of an arbitrary partition, for which the consensus would only average neighboring cells. For example, a square of
 a grid and its best match in a randomly shifted grid share 9/16 of their area on average. This corresponds to J = 0.39.
 
-Directions come from the lift of F', but R comes from the lift of F (see `with_original_reliability`). The R of F
-measures the agreement of the regions before the consensus, and predicts the accuracy of F' better than the R of F'.
+Directions come from the lift of F', but the reliability R comes from the lift of F (see `with_original_reliability`).
+The R of F measures the agreement of the regions before the consensus. It predicts the accuracy of F' better than the R
+of F' does.
 """
 
 from __future__ import annotations
@@ -61,7 +63,8 @@ class Overlaps(NamedTuple):
     """Overlaps between regions of different views at one level."""
 
     iou: SparseRows
-    """J, the soft intersection over union of all pairs of regions, a symmetric [S, S] matrix without its diagonal."""
+    """J, the soft intersection over union of regions in different views, as a symmetric [S, S] matrix. Values below
+    `MIN_OVERLAP` are left out."""
     inside: Float[Tensor, " nnz"]
     """c_ts of every entry (s, t) of `iou`, the share of region t that lies in region s."""
     agreement: float
@@ -85,7 +88,7 @@ class Consensus(NamedTuple):
     features: Float[Tensor, "s d"]
     """F', the features after the consensus, as unit rows; rows that are 0 in F, the features before it, stay 0."""
     agreement: list[float]
-    """B of every level, the weighted mean of the best overlaps, in 0..1."""
+    """B of every level, in ascending order of the levels. B is the weighted mean of the best overlaps, in 0..1."""
     gaussians: int
     """Number of Gaussians sampled."""
 

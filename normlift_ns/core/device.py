@@ -40,7 +40,7 @@ class TensorRecord:
 
 @cache
 def has_triton() -> bool:
-    """Return True if Triton 3 or newer is installed.
+    """Return True if Triton 3 or newer is installed, or a Triton whose version is unknown.
 
     torch 2.4 and later on Linux include it. Without Triton, the default backend on a GPU is gsplat.
     """
@@ -118,9 +118,10 @@ def choose_device(device: str) -> str:
     if device.startswith("cuda"):
         count = torch.cuda.device_count()
         if count == 0:
-            raise InputError(f"--device {device} needs a CUDA device, but this machine has none; use --device cpu")
+            raise InputError(f"--device {device} needs a CUDA device, but PyTorch finds none; use --device cpu")
         if int(device[5:] or 0) >= count:
-            raise InputError(f"--device {device} does not exist; choose one of cuda:0 to cuda:{count - 1}")
+            existing = "cuda:0" if count == 1 else f"one of cuda:0 to cuda:{count - 1}"
+            raise InputError(f"--device {device} does not exist; use {existing}")
     if device != "auto":
         return device
     return "cuda" if torch.cuda.is_available() else "cpu"
@@ -194,8 +195,8 @@ class AdaptiveBatches:
     ) -> Iterator[list[Tensor]]:
         """Yield the result rows of each part, one row per item. A batch may contain items of several parts.
 
-        All batches have the same shape, because the last one is padded with copies of its last item. The other items
-        of a batch therefore change a row only by rounding.
+        The last batch is padded with copies of its last item. All batches therefore have the same shape, unless the
+        batch size is reduced, and the other items of a batch change a row only by rounding.
 
         The next part is requested when a batch has room for more items. Rows are yielded as soon as they are computed.
 

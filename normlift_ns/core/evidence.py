@@ -46,11 +46,11 @@ class Entries(NamedTuple):
 @check_arguments
 @dataclass(frozen=True)
 class Evidence(TensorRecord):
-    """Sparse matrix E_js, and the weight of every Gaussian j in the unlabeled pixels of every view.
+    """Sparse matrix E_js of N Gaussians j and S regions s, with the weights of unlabeled pixels.
 
-    E_js is the sum of A_ij, the compositing weight of Gaussian j in pixel i, over the pixels i of region s. Columns s
-    number the regions of all views consecutively, like the rows of the feature table. The columns of a row ascend. The
-    constructor raises ValueError if the arrays are inconsistent.
+    E_js is the sum of A_ij ** weight_power over the pixels i of region s. A_ij is the compositing weight of Gaussian j
+    in pixel i. Columns s number the regions of all views consecutively, like the rows of the feature table. The columns
+    of a row ascend. The constructor raises ValueError if the arrays are inconsistent.
 
     >>> import torch
     >>> from normlift_ns import Evidence
@@ -65,7 +65,7 @@ class Evidence(TensorRecord):
     """
 
     rows: SparseRows
-    """E, [N, S]. Every entry E_js is the sum of A_ij ** weight_power, > 0."""
+    """E, [N, S]. All entries are >= 0."""
     region_view: Int32[Tensor, " s"]
     """Index of the view of every column, in non-decreasing order."""
     unlabeled: SparseRows
@@ -73,7 +73,7 @@ class Evidence(TensorRecord):
     num_views: int
     """Number of views, including those without regions."""
     weight_power: int = 1
-    """Exponent of A_ij in E. The paper uses 1, and SFS's code uses 2. With 0, E counts pixels."""
+    """Exponent of A_ij in E. The paper uses 1, and the code of Splat Feature Solver uses 2. With 0, E counts pixels."""
     num_excluded: int = 0
     """Number of Gaussians that were not drawn because a parameter was not finite or out of range."""
 
@@ -212,8 +212,8 @@ class Evidence(TensorRecord):
         to rounding, because sums of A_ij ** weight_power are additive for any power. Columns that map to -1 are added
         to the unlabeled weight of their view.
 
-        With several levels, W_jv and the unlabeled weight count every pixel once per level. N_eff and R do not depend
-        on the scale of W.
+        With several levels, W_jv and the unlabeled weight count every pixel once per level. The effective number of
+        views N_eff and the reliability R do not depend on the scale of W.
 
         Args:
             columns: New column of every old column, or -1 for none, with one row per level.
@@ -221,11 +221,9 @@ class Evidence(TensorRecord):
         Raises:
             ValueError: If a new column does not exist, or belongs to a different view than its old columns.
         """
-        if columns.shape[1] != self.num_regions or not bool(((columns >= -1) & (columns < len(region_view))).all()):
-            raise InputError(
-                f"columns must be [levels, {self.num_regions}] with values in -1..{len(region_view) - 1}, got "
-                f"{tuple(columns.shape)}"
-            )
+        if columns.shape[1] != self.num_regions:
+            raise InputError(f"columns must have shape [levels, {self.num_regions}], got {tuple(columns.shape)}")
+        check_rows("columns", columns, len(region_view), low=-1)
         columns, region_view = (x.to(self.region_view.device) for x in (columns.long(), region_view))
         level, column = (columns >= 0).nonzero(as_tuple=True)
         if not torch.equal(region_view[columns[level, column]], self.region_view[column]):

@@ -98,12 +98,13 @@ class SemanticField(TensorRecord):
 
         Args:
             source: Result of `refine` (default: no refinement).
-            tolerance: Largest error of the cosine between any Gaussian and any unit vector, > 0.
+            tolerance: Largest error of the cosine between any Gaussian and any unit vector, > 0. It does not affect
+                storage "evidence" and "float16".
             storage: "auto" chooses the smallest storage whose bound is within the tolerance.
             provenance: JSON-ready metadata for the manifest, such as source config, step, encoder and hyperparameters.
         Raises:
-            ValueError: If `means` or `source` has the wrong length, an option is invalid, or no rank meets the
-                tolerance for storage "low_rank".
+            ValueError: If `means` or `source` has the wrong length, `source` has an invalid index, an option is
+                invalid, or no rank meets the tolerance for storage "low_rank".
         """
         n = len(lifted.scalars.norm)
         if len(means) != n or (source is not None and len(source) != n):
@@ -202,6 +203,9 @@ class SemanticField(TensorRecord):
 
         Args:
             negatives: Vectors of the negative prompts, for rules that need them.
+        Raises:
+            ValueError: If a vector is invalid as in `query`, or the rule needs negatives or null levels that are
+                missing.
         """
         count = len(text_vectors)
         cosine = self.query(

@@ -90,7 +90,8 @@ class GaussianScene(TensorRecord):
     def drawable(self) -> Bool[Tensor, " n"]:
         """Mask of the Gaussians that are drawn.
 
-        Their parameters are finite and within limits for float32, which do not depend on the precision or the backend.
+        Their parameters are finite and within limits for float32. The limits are the same for all precisions and
+        backends.
         """
         length = self.quats.float().abs().amax(dim=1)  # the length up to a factor of 2
         low, high = QUATERNION_RANGE
@@ -166,7 +167,7 @@ class Camera:
 
     @check_arguments
     def downscaled(self, factor: float) -> Camera:
-        """Return the camera with its image size multiplied by `factor`, > 0; factors above 1 count as 1.
+        """Return the camera with its image size multiplied by `factor`, > 0, and rounded; factors above 1 count as 1.
 
         >>> K = torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
         >>> camera = Camera(K, torch.eye(4), width=160, height=120)

@@ -2,15 +2,17 @@
 
 Half of the views are left out, the others are lifted, and the left-out regions are compared with the lift. Then the
 halves are swapped. Let s be a region of a left-out view, and u_j the directions of the Gaussians from the kept views.
-If the consensus is enabled, these directions follow a consensus among the kept views::
+If the consensus is enabled, these directions follow a consensus among the kept views. J and F' are those of
+`core.consensus`, with b = 1 for F'::
 
     U_s        = normalize(sum_j E_js u_j)                      feature of the region in the kept views
     recognized = U_s is nearer to F_s than to all other regions of its view
     confirmed  = sum_t J_st F_t over kept regions t with J_st > 0.3 is nearer to F_s than to all others of its view
     agreement  = mean of <U_s, F'_s> over all regions, F'_s after a consensus among the left-out views alone
 
-Only confirmed regions are evaluated. A region without a similar region in other views, such as a wrong or merged mask,
-should not be recognized. These measures do not include the vote, and do not predict whether the vote helps.
+Recognition is measured for confirmed regions only. A region without a similar region in other views, such as a wrong or
+merged mask, should not be recognized. Regions without a feature, or whose Gaussians have no direction, do not count.
+These measures do not include the vote, and do not predict whether the vote helps.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ PARTNER_IOU = 0.3
 
 
 class LeftOut(NamedTuple):
-    """Recognition of left-out views by the lift of the other views."""
+    """Recognition of the regions of left-out views by a lift of the other views."""
 
     recognized: int
     """Number of confirmed regions that the lift recognizes."""

@@ -8,7 +8,7 @@ Let E_js be the evidence of Gaussian j and F_s the unit feature of region s. Equ
     C_intra = sum_v ||S_jv|| / W_j                            eq. 7
     C_inter = ||sum_v S_jv|| / sum_v ||S_jv||                 eq. 7, so that ||f_j|| = C_intra C_inter
     N_eff   = W_j ** 2 / sum_v W_jv ** 2
-    R_j     = ||f_j|| N_eff / (N_eff + beta)                  eq. 8
+    R_j     = ||f_j|| N_eff / (N_eff + beta)                  eq. 8, in `core.reliability`
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from torch import Tensor
 from normlift_ns.core.arguments import check_arguments, check_rows
 from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.reliability import reliability
 from normlift_ns.core.sparse import CANCELLATION_RATIO, CHUNK_ELEMENTS, MANY_ENTRIES, SparseRows, segment_sum
 from normlift_ns.errors import InputError
 from normlift_ns.options import UnlabeledMode
@@ -40,7 +41,7 @@ _LENGTH_TOLERANCE = 1e-2
 class Scalars(TensorRecord):
     """Norm, consistency, reliability and weight of every Gaussian.
 
-    If W_j < 1e-15 or f_j = 0, all fields except `view_count` and `weight` are 0.
+    If W_j < 1e-15, or f_j = 0 up to rounding, all fields except `view_count` and `weight` are 0.
 
     >>> import torch
     >>> from normlift_ns import Evidence, lift
@@ -190,33 +191,6 @@ def lift(
     }
     scalars = Scalars(**{name: x.to(table.dtype) for name, x in values.items()}, view_count=view_count.int())
     return Lifted(scalars, evidence, table)
-
-
-def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], beta: float) -> Float[Tensor, "*n"]:
-    """Return R_j, equation 8 of the paper, or 0 without evidence.
-
-    Args:
-        norm: ||f_j||. With 1, the result is the factor N_eff / (N_eff + beta).
-        n_eff: N_eff, or 0 without evidence.
-        beta: Prior strength as a number of views, >= 0.
-
-    >>> reliability(0.6, torch.tensor([0.0, 2.0]), beta=1.0)
-    tensor([0.0000, 0.4000])
-    """
-    return torch.where(n_eff > 0, norm * n_eff / (n_eff + beta), 0.0)
-
-
-def norm_of_reliability(scalars: Scalars, beta: float) -> Float64[Tensor, " n"]:
-    """Return ||f_j|| from R_j, the inverse of `reliability`.
-
-    After a consensus, R_j and therefore the result are those of the features before the consensus.
-
-    Args:
-        scalars: Scalars of a lift with the paper's R.
-        beta: Prior strength, as for `reliability`.
-    """
-    views = scalars.n_eff.double()
-    return torch.where(views > 0, scalars.reliability.double() * (views + beta) / views, 0.0).clamp(max=1)
 
 
 def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:

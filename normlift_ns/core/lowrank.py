@@ -97,8 +97,8 @@ def smallest_basis(lifted: Lifted, tolerance: float, team: Communicator | None =
 _QUANTILES = (0.0, 0.5, 0.9, 0.99, 1.0)
 _BLOCK_ROWS = 1024
 _CPU_BLOCK, _GPU_BLOCK = 2**19, 2**25
-"""Number of elements that a query converts to float32 at a time. Blocks that fit into the CPU cache are four times as
-fast."""
+"""Number of elements that a query converts to float32 at a time, on CPU and GPU. Blocks that fit into the CPU cache are
+four times as fast."""
 
 
 @dataclass(frozen=True)

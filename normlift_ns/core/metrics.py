@@ -89,7 +89,7 @@ def mask_iou(predicted: Bool[Tensor, "h w"], truth: Bool[Tensor, "h w"], *, empt
     """Return |predicted and truth| / |predicted or truth|, in 0..1.
 
     Args:
-        empty: Result for two empty masks (default: NaN). SFS's code uses 0.
+        empty: Result for two empty masks (default: NaN). The code of Splat Feature Solver uses 0.
     """
     union = int((predicted | truth).sum())
     return int((predicted & truth).sum()) / union if union > 0 else empty

@@ -17,7 +17,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import check_number
 
 MAX_NEIGHBORS = 1024
-"""Largest K. Memory grows with K times the number of Gaussians, and a vote compares all pairs of neighbors."""
+"""Largest number K of neighbors. Memory grows with K times the number of Gaussians."""
 _MAX_UNCERTAIN = 1000
 """Largest number of rows that the GPU repeats with all distances because it could not certify their neighbors.
 
@@ -75,7 +75,7 @@ def nearest_neighbors(
         team: Processes that call this function together, each for a part of the same Gaussians (default: only this
             process).
     Raises:
-        ValueError: If `k` is less than 1 or more than `MAX_NEIGHBORS`.
+        ValueError: If `k` is less than 1 or more than `MAX_NEIGHBORS`, or `of` has an invalid index.
 
     >>> import torch
     >>> from normlift_ns import nearest_neighbors

@@ -1,9 +1,9 @@
 """Null level of every Gaussian, the cosine that a prompt must exceed to differ from unrelated text.
 
 The level is the k-th largest cosine between a Gaussian and the texts of the null vocabulary. Here, k is 3 % of the
-number of texts, and at least 2. A prompt above the level is therefore more similar than 97 % of unrelated texts. If the
-null vocabulary is the list of all texts of a scene, only the most similar text is above the level.
-docs/honest_answers.md compares other shares.
+number of texts, rounded, and at least 2. With many texts, a prompt above the level is therefore more similar than about
+97 % of them. If the null vocabulary consists of the texts of a scene, at most 83, only the most similar text is above
+the level. docs/honest_answers.md compares other shares.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def with_null_level(field: SemanticField, vectors: Float[Tensor, "m d"]) -> Sema
     """Return a field with null levels, and with the top cosine of every null text in its manifest.
 
     Args:
-        vectors: One vector per text of the null vocabulary, M >= 2, of any norm > 0.
+        vectors: Vectors of any norm > 0, one for each of at least two texts of the null vocabulary.
     """
     count = max(2, round(NULL_SHARE * len(vectors)))
     own, source = field.valid(refined=False), field.source.long()

@@ -112,14 +112,15 @@ def relevancy(
 
     Args:
         positive: Cosine to each prompt, as a tensor or NumPy array.
-        negative: Cosine to each negative (rule "lerf") or background (rule "margin") prompt.
+        negative: Cosine to each negative prompt (rules "lerf" and "margin"), or the null level (rule "contrast").
         rule: "contrast" is "lerf" with a null level [..., 1] as the only negative. "cosine" is the cosine itself, in
             -1..1. "lerf" is the smallest softmax of the prompt against one negative, in 0..1 (LERF, section 3.4). At
             0.5, prompt and negative are equally similar. "margin" is the cosine minus the largest background cosine,
             in -2..2.
         temperature: Factor of the cosines inside the softmax, > 0.
     Raises:
-        ValueError: If a value is not in -1..1, the rule is unknown, or the rule needs negatives and none are given.
+        ValueError: If a cosine is not in -1..1, `temperature` is out of range, the rule is unknown, or the rule needs
+            negatives and none are given.
 
     >>> import torch
     >>> from normlift_ns import relevancy
@@ -150,7 +151,10 @@ def _relevancy(positive: Any, negative: Any, rule: RelevancyRule, temperature: f
         convert = np.asarray if isinstance(positive, np.ndarray) else _namespace(positive).as_tensor
         negative = cast(Any, convert(negative))
     if rule == "contrast" and (negative is None or negative.shape[-1] == 0):
-        raise InputError('rule "contrast" needs a null level, but this field has none; choose rule "cosine"')
+        raise InputError(
+            'rule "contrast" compares with unrelated words, but this run stores no comparison; lift again, or choose '
+            'rule "cosine"'
+        )
     if RELEVANCY_RULES[rule].needs_negatives and (negative is None or negative.shape[-1] == 0):
         raise InputError(
             f'rule "{rule}" needs negative prompts, got none; '
@@ -172,7 +176,7 @@ def gaussian_relevancy(
 
 
 def top_values(values: Float[ArrayT, "n q"]) -> list[float]:
-    """Return the interpolated 99.9 % quantile of each column, N >= 1.
+    """Return the interpolated 99.9 % quantile of each column of a matrix with at least one row.
 
     On a GPU, only these numbers are copied to the CPU.
 

@@ -43,7 +43,10 @@ class View(NamedTuple):
 
     @check_arguments
     def downscaled(self, height: int, width: int) -> View:
-        """Downscale the image by averaging pixels. A mask is True only if it is True for all averaged pixels."""
+        """Downscale the image and its camera by averaging pixels.
+
+        A pixel of the mask is True only if it is True for all averaged pixels.
+        """
         camera = self.camera
         scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
 
@@ -120,7 +123,7 @@ class Scene(Protocol):
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
-        """Rasterization mode of the training. A lift must use the same mode."""
+        """Rasterization mode of the training, which a lift should use too."""
         ...
 
     @property
@@ -165,9 +168,10 @@ class Scene(Protocol):
 
 
 def camera_summary(cameras: Sequence[Camera]) -> list[float]:
-    """Return a summary of cameras for a manifest. It depends on every camera and on their order.
+    """Return numbers that summarize cameras, for a manifest.
 
-    It consists of the number of cameras and weighted means of size, intrinsics and pose. Weights increase from 1 to 2.
+    They are the number of cameras, and weighted means of size, intrinsics and pose. The weights increase
+    from 1 for the first camera to 2 for the last, so that the order of the cameras also matters.
 
     >>> import torch
     >>> left = Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)

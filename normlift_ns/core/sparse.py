@@ -65,7 +65,9 @@ class SparseRows(TensorRecord):
 
     @staticmethod
     def stack(parts: Sequence[tuple[Tensor, Tensor, Tensor]], num_rows: int, device: torch.device) -> SparseRows:
-        """Join lists of (row, column, weight), each sorted by row. Columns must ascend from list to list.
+        """Join lists of (row, column, weight), each sorted by row and then by column.
+
+        In every row, the columns of a list must be larger than those of earlier lists.
 
         The CPU does not sort, but writes every entry directly behind those of its row in earlier lists. On a GPU, a
         single stable sort is faster if it fits into memory.
@@ -114,8 +116,8 @@ class SparseRows(TensorRecord):
         ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.numel() > 0 else []
         if ends != [0, size] or self.weight.numel() != size or bool((lengths < 0).any()):
             raise InputError(
-                f"row offsets must rise from 0 to the number of entries, found {ends} for {size} columns and "
-                f"{self.weight.numel()} weights"
+                "row offsets must begin with 0, never decrease, and end with the number of entries; the first and last "
+                f"are {ends}, for {size} columns and {self.weight.numel()} weights"
             )
         low, high = (int(x) for x in self.column.aminmax()) if size > 0 else (0, -1)
         if low < 0:

@@ -20,8 +20,8 @@ from normlift_ns.rasterization.settings import RasterSettings
 MIN_PSNR = 24.0
 """Usual minimum PSNR in dB. Real scenes reach 25 to 40 dB on their training images."""
 MIN_MARGIN = 3.0
-"""Minimum lead in dB over the PSNR of the images' mean color. Cameras in a wrong world have less. Cameras in the right
-world have at least 1 dB more than this minimum (`python -m research.worlds`)."""
+"""Minimum lead in dB over the PSNR of the images' mean color. In `python -m research.worlds`, cameras in a wrong world
+have less, and cameras in the right world have at least 1 dB more than this minimum."""
 _MIN_VISIBLE = 0.001
 """Minimum fraction of all Gaussians that at least one view contains."""
 
@@ -51,14 +51,14 @@ class Alignment(NamedTuple):
 def measure_alignment(
     scene: Scene, settings: RasterSettings | None = None, *, device: str = "cpu", explain: bool = True
 ) -> Alignment:
-    """Render three training views with at most 400 pixels on the longer side, and compare them with their images.
+    """Render the views of `sample_views`, and compare the renders with the images.
 
     Args:
         scene: Gaussians, cameras and images.
         settings: Constants of the rasterizer at the original image size. None: the constants that the scene records.
         device: torch device to render on.
         explain: True to look for a better lens or primitive in any case. False to skip this search if the PSNR or the
-            margin is below the usual minimum.
+            margin is below the usual minimum. See `explain_misfit`.
     Raises:
         FileNotFoundError, ValueError: An image is missing or cannot be read.
     """
@@ -103,8 +103,7 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
         ValueError: The Gaussians and the cameras do not belong together.
     """
     causes = "Likely causes: " + (
-        "the images, their exposure or transforms.json have changed since the training, or the training was stopped "
-        "early"
+        "the images, their exposure or the cameras have changed since the training, or the training was stopped early"
         if trained_cameras
         else "cameras of another capture; cameras in a world that --world-transform auto does not try (give a file "
         "with the transform; for gsplat's trainer see --gsplat-normalize); other images, or distorted images with "
@@ -113,13 +112,13 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     )
     if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(
-            "The cameras do not show this splat: each of three training views contains at most "
+            "The cameras do not show this splat: each training view that was checked contains at most "
             f"{match.visible_fraction:.2%} of its Gaussians. {causes}. To lift anyway, give --check-alignment False."
         )
     reason = match.cause or f"{causes}."
     if match.margin < MIN_MARGIN:
         problem = (
-            f"The splat does not match its images: renders from three of the cameras reach {match.psnr:.1f} "
+            f"The splat does not match its images: renders of training views reach {match.psnr:.1f} "
             f"dB, {abs(match.margin):.1f} dB {'less' if match.margin < 0 else 'more'} than the mean color of an image. "
             f"Expected at least {MIN_MARGIN:.0f} dB more. {reason}"
         )
@@ -131,14 +130,14 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
         return match.cause
     if match.psnr >= MIN_PSNR > lowest:
         return (
-            f"The render of {name}, one of three training images that were checked, has a PSNR of only {lowest:.1f} "
+            f"The render of {name}, one of the training images that were checked, has a PSNR of only {lowest:.1f} "
             f"dB; {MIN_PSNR:.0f} dB or more is usual. Check whether this image or its camera has changed since the "
             "training. If so, other images may have changed too."
         )
     if match.psnr < MIN_PSNR:
         return (
-            f"Renders of three training images have a PSNR of {match.psnr:.1f} dB; {MIN_PSNR:.0f} dB or more is usual. "
-            f"The semantics will be equally inexact. {causes}."
+            f"Renders of training views have a mean PSNR of {match.psnr:.1f} dB; {MIN_PSNR:.0f} dB or more is usual. "
+            f"Expect less accurate semantics. {causes}."
         )
     return None
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from normlift_ns.core.gaussians import SH_C0
-from normlift_ns.data.quantization import opacity_logits
+from normlift_ns.data.compressed_ply import opacity_logits
 from normlift_ns.data.splat import SplatFile, SplatParameters, validate_splat
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import open_regular
@@ -22,7 +22,7 @@ def read_antimatter(path: Path) -> SplatFile:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file size is not a multiple of 32 bytes, or the Gaussians cannot be rendered.
+        ValueError: The file is empty, its size is not a multiple of 32 bytes, or the Gaussians cannot be rendered.
     """
     if not path.is_file():
         raise FileNotFoundError(f"The .splat file {path} does not exist. Give an existing file with --load-ply.")

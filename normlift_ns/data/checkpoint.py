@@ -115,7 +115,7 @@ class Checkpoint(NamedTuple):
     path: Path
     step: int
     model: dict[str, Tensor]
-    """State of the model on the CPU, without LPIPS. Tensors named gauss_params.* are in float32."""
+    """State of the model on the CPU, without LPIPS. The parameters of the Gaussians are in float32."""
     splat: SplatParameters
     """Parameters of the Gaussians, from gauss_params.* in the state."""
 
@@ -124,20 +124,20 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
     """Return the path of the checkpoint of a step, or of the last step if `step` is None.
 
     Raises:
-        FileNotFoundError: There is no such checkpoint. The message lists the existing steps.
+        FileNotFoundError: The folder has no such checkpoint. The message lists the existing steps.
     """
     found = sorted(folder.glob("step-*.ckpt"))
     checkpoints = {number: path for path in found if (number := _step_of(path)) is not None}
     if not checkpoints:
         raise FileNotFoundError(
-            f"There is no checkpoint in {folder}. Expected a file such as step-000029999.ckpt, which ns-train writes "
+            f"{folder} has no checkpoint. Expected a file such as step-000029999.ckpt, which ns-train writes "
             "every --steps-per-save steps and at the end. Copy it to this folder, or finish the training."
         )
     if step is None:
         return checkpoints[max(checkpoints)]
     if step not in checkpoints:
         raise FileNotFoundError(
-            f"There is no checkpoint of step {step} in {folder}, which has the steps "
+            f"{folder} has no checkpoint of step {step}, but of the steps "
             f"{', '.join(map(str, sorted(checkpoints)))}. Give one of them with --load-step, or omit --load-step for "
             "the last step."
         )
@@ -195,7 +195,7 @@ def validate_step(step: Any, path: Path) -> int:
     if type(step) is not int or not 0 <= step < _MAX_STEP:  # a bool is not a step
         raise InputError(
             f"{path}: its step is {str(step)[:40]} ({type(step).__name__}), expected a whole number from 0 to "
-            f"{_MAX_STEP:,}. Copy it again, or give another checkpoint."
+            f"{_MAX_STEP - 1:,}. Copy it again, or give another checkpoint."
         )
     expected = _step_of(path)
     if expected is not None and expected != step:
@@ -221,7 +221,7 @@ def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
         ValueError: The file is truncated or damaged, or contains other Python objects.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no file {path}. Expected a file written by torch.save; {advice}.")
+        raise FileNotFoundError(f"{path} does not exist. Expected a file written by torch.save; {advice}.")
     check_regular(path)
     _check_archive(path, advice)
     try:
@@ -260,15 +260,14 @@ def _check_archive(path: Path, advice: str) -> None:
                     f"{path} declares more content than its {size:,} bytes, or contains compressed entries, which "
                     f"torch.save never writes. Copy it again, or {advice}."
                 )
-            damage = archive.testzip()
+            wrong = archive.testzip()
+            damage = None if wrong is None else f"the checksum of {wrong} does not match its content"
     except InputError:
         raise
     except Exception as error:  # zipfile raises any kind of exception on a damaged file
         damage = str(error)
     if damage is not None:
-        raise InputError(
-            f"{path} is damaged ({damage}): a checksum does not match its content. Copy it again, or {advice}."
-        )
+        raise InputError(f"{path} is damaged ({damage}). Copy it again, or {advice}.")
 
 
 def _model_state(pipeline: dict[Any, Any], path: Path) -> dict[str, Tensor]:
@@ -330,9 +329,9 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
     splats = [splat_from_parameters(rank.parameters, file) for file, rank in zip(files, loaded)]
     steps = {rank.step for rank in loaded}
     if len(steps) > 1 or len({splat.degree for splat in splats}) > 1:
-        steps_named = f"steps: {', '.join(map(str, sorted(steps)))}"
+        differing = f"steps: {', '.join(map(str, sorted(steps)))}" if len(steps) > 1 else "degrees of harmonics"
         raise InputError(
-            f"{files[0].parent} has ranks with different {steps_named if len(steps) > 1 else 'spherical harmonics'}. "
+            f"{files[0].parent} has ranks with different {differing}. "
             "Expected the files of one training run. Copy these files to a separate folder."
         )
     names = splats[0].parameters
@@ -345,8 +344,8 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
 def _rank_files(path: Path) -> tuple[Path, ...]:
     if not path.is_file():
         raise FileNotFoundError(
-            f"There is no checkpoint at {path}. With --load-gsplat, give a file of gsplat's simple_trainer, for "
-            "example results/garden/ckpts/ckpt_29999_rank0.pt."
+            f"{path} is not a file. With --load-gsplat, give a checkpoint of gsplat's simple_trainer, for example "
+            "results/garden/ckpts/ckpt_29999_rank0.pt."
         )
     match = _RANK.fullmatch(path.name)
     if match is None:

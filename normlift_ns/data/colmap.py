@@ -59,7 +59,7 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
         folder: Folder of the project or of the reconstruction.
         say: Function that is called with a message if there are several reconstructions.
     Raises:
-        FileNotFoundError: None of these folders contains a reconstruction. The message lists them.
+        FileNotFoundError: The folder does not exist, or none of these folders contains a reconstruction.
     """
     if not folder.is_dir():
         raise FileNotFoundError(
@@ -80,7 +80,7 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
         return models[0]
     counts = {model: _count_images(model) for model in models}
     largest = max(models, key=counts.__getitem__)
-    listed = ", ".join(f"{relative_name(model, folder)} with {count:,} images" for model, count in counts.items())
+    listed = ", ".join(f"{relative_name(model, folder)} (images: {count:,})" for model, count in counts.items())
     say(
         f"{folder} contains several reconstructions: {listed}. The largest one, {relative_name(largest, folder)}, is "
         "used. To use another one, give its folder with --colmap."
@@ -151,15 +151,17 @@ def _check_cameras(listed: list[ColmapCamera], model: Path) -> dict[int, ColmapC
     """Return the cameras by ID; raise InputError for duplicate IDs and invalid sizes or parameters."""
     cameras: dict[int, ColmapCamera] = {}
     for camera in listed:
-        if camera.camera_id in cameras or not (0 < camera.width <= _MAX_SIDE and 0 < camera.height <= _MAX_SIDE):
+        if camera.camera_id in cameras:
+            raise InputError(f"{model}: camera {camera.camera_id} occurs twice. {_ADVICE}")
+        if not (0 < camera.width <= _MAX_SIDE and 0 < camera.height <= _MAX_SIDE):
             raise InputError(
-                f"{model}: camera {camera.camera_id} of {camera.width:.6g} x {camera.height:.6g} pixels occurs twice, "
-                f"or its sides are not in 1..{_MAX_SIDE:,} pixels. {_ADVICE}"
+                f"{model}: camera {camera.camera_id} has {camera.width:.6g} x {camera.height:.6g} pixels. Expected "
+                f"1 to {_MAX_SIDE:,} pixels along a side. {_ADVICE}"
             )
         if not (np.abs(camera.params) < _MAX_VALUE).all():
             raise InputError(
                 f"{model}: camera {camera.camera_id} has the parameters {camera.params}. Expected finite numbers "
-                f"below {_MAX_VALUE:g}. {_ADVICE}"
+                f"between {-_MAX_VALUE:g} and {_MAX_VALUE:g}. {_ADVICE}"
             )
         cameras[camera.camera_id] = camera
     return cameras
@@ -182,8 +184,8 @@ def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera]
             else "no image is registered"
         )
         raise InputError(
-            f"{model} has {len(cameras)} cameras and {len(images)} registered images: {problem}. Expected one or more "
-            "images, each with its camera. Copy the whole reconstruction again."
+            f"{model} is incomplete: {problem} (cameras: {len(cameras)}, registered images: {len(images)}). Expected "
+            "one or more images, each with its camera. Copy the whole reconstruction again."
         )
     if len({image.image_id for image in images}) < len(images):
         raise InputError(f"{model} has two images with the same ID. {_ADVICE}")
@@ -230,7 +232,7 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
         advice: Advice on missing images, for error messages.
     Raises:
         FileNotFoundError: The reconstruction, an image or a mask is missing.
-        ValueError: As in `read_colmap_model` and `colmap_intrinsics`.
+        ValueError: As in `read_colmap_model` and `colmap_intrinsics`. Also if text and binary files differ.
     """
     remarks: list[str] = []
     model = find_colmap_model(folder, remarks.append)
@@ -307,9 +309,9 @@ def _read(
     if as_text or not path.is_file():
         path = model / f"{name}.txt"
     if not path.is_file():
+        found = f"has cameras.txt, but not {name}.txt" if as_text else f"has neither {name}.bin nor {name}.txt"
         raise FileNotFoundError(
-            f"{model} has neither {name}.bin nor {name}.txt. Expected cameras, images and points3D, as COLMAP's mapper "
-            f"writes them. {_ADVICE}"
+            f"{model} {found}. Expected cameras, images and points3D, as COLMAP's mapper writes them. {_ADVICE}"
         )
     try:
         if path.suffix == ".bin":
@@ -371,7 +373,10 @@ def _cameras_text(lines: list[str]) -> Iterator[ColmapCamera]:
     for line in filter(None, lines):
         camera_id, name, width, height, *parameters = line.split()
         if name in counts and len(parameters) != counts[name]:
-            raise InputError(f"camera {camera_id} has {len(parameters)} parameters, but {name} needs {counts[name]}")
+            raise InputError(
+                f"camera {camera_id} has the wrong number of parameters for {name}: {len(parameters)}, expected "
+                f"{counts[name]}"
+            )
         yield ColmapCamera(int(camera_id), name, int(width), int(height), tuple(map(float, parameters)))
 
 

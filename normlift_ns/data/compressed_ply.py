@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int64, UInt8
 from plyfile import PlyData, PlyElement
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from normlift_ns.core.gaussians import SH_C0
-from normlift_ns.data.quantization import join_largest, normalize_quats, opacity_logits, split_largest, to_bytes
 from normlift_ns.errors import InputError
 
 PACKED = "packed_position"
@@ -64,8 +64,8 @@ def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor],
     _check_element(path, "vertex", vertex, _VERTEX, "u")
     assert chunk is not None
     if n > len(chunk) * _CHUNK_ROWS or (harmonics is not None and len(harmonics) != n):
-        extra = "" if harmonics is None else f" and {len(harmonics):,} rows of spherical harmonics"
-        raise _unmatched(path, f"{n:,} Gaussians in {len(chunk):,} chunks of 256{extra}, expected matching numbers")
+        extra = "" if harmonics is None else f", {len(harmonics):,} spherical harmonics"
+        raise _unmatched(path, f"its numbers of rows do not match ({n:,} Gaussians, {len(chunk):,} chunks{extra})")
     words = {name: torch.from_numpy(vertex[name].astype(np.int64)) for name in _VERTEX}
     rotation, color = words["packed_rotation"], _units(words["packed_color"], (8, 8, 8, 8))
     means, scales = (_bounds(chunk, group, n) for group in ("means", "scales"))
@@ -151,7 +151,7 @@ def _check_element(path: Path, element: str, table: np.ndarray | None, names: tu
 
 def _unmatched(path: Path, problem: str) -> InputError:
     return InputError(
-        f"{path} is a damaged compressed PLY file with {problem}. Write it again, or give the uncompressed PLY file."
+        f"{path} is a damaged compressed PLY file: {problem}. Write it again, or give the uncompressed PLY file."
     )
 
 
@@ -175,7 +175,7 @@ def _unpack_harmonics(path: Path, table: np.ndarray | None, n: int) -> Float[Ten
         return torch.zeros(n, 0, 3)
     _check_element(path, "sh", table, names, "u")
     if len(names) not in (9, 24, 45, 72):
-        raise _unmatched(path, f"{len(names)} spherical harmonics, expected 9, 24, 45 or 72")
+        raise _unmatched(path, f"it has {len(names)} spherical harmonics, expected 9, 24, 45 or 72")
     packed = torch.from_numpy(np.stack([table[name].astype(np.float32) for name in names], axis=1))
     units = torch.where(packed == 0, 0.0, torch.where(packed == 255, 1.0, (packed + 0.5) / 256))
     return ((units - 0.5) * _SH_RANGE).reshape(n, 3, -1).transpose(1, 2).contiguous()
@@ -219,3 +219,44 @@ def _chunk_order(means: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
         rows = rows[np.argpartition(means[rows, axis], middle)]
         boxes += [rows[middle:], rows[:middle]]
     return np.concatenate(chunks)
+
+
+# Conversion of quaternions and opacities, for all compressed splat formats.
+
+
+_OTHERS = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Indices of the three other components of a quaternion, by the index of its largest component."""
+_MIN_OPACITY = 1e-6
+
+
+def opacity_logits(opacities: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Return the logits of opacities, which are clamped to 1e-6..1 - 1e-6 so that the logits are finite."""
+    return opacities.double().logit(eps=_MIN_OPACITY).float()
+
+
+def to_bytes(values: Float[Tensor, "*n"]) -> UInt8[np.ndarray, "*n"]:
+    """Round values, clamp them to 0..255, and convert them to bytes."""
+    return values.round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+def normalize_quats(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+    """Return unit quaternions (w, x, y, z); quaternions that are zero or not finite become the identity."""
+    unit = normalize(quats / quats.abs().amax(dim=1, keepdim=True), dim=1)
+    return torch.where(unit.isfinite().all(dim=1, keepdim=True), unit, unit.new_tensor([1.0, 0, 0, 0]))
+
+
+def split_largest(unit: Float[Tensor, "n 4"]) -> tuple[Int64[Tensor, " n"], Float[Tensor, "n 3"]]:
+    """Return the index of the largest component of unit quaternions, and their other three components.
+
+    If the largest component is negative, the signs of the others are changed.
+    """
+    index = unit.abs().argmax(dim=1, keepdim=True)
+    positive = unit * torch.where(unit.gather(1, index) < 0, -1.0, 1.0)  # q and -q are the same rotation
+    return index[:, 0], positive.gather(1, _OTHERS[index[:, 0]])
+
+
+def join_largest(index: Int64[Tensor, " n"], others: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """Return unit quaternions as float32, given the results of `split_largest`."""
+    largest = (1 - others.square().sum(dim=1, keepdim=True)).clamp(min=0).sqrt()
+    unit = torch.zeros(len(index), 4, dtype=others.dtype).scatter_(1, _OTHERS[index], others)
+    return unit.scatter_(1, index[:, None], largest).float()

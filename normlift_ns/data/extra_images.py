@@ -87,8 +87,8 @@ def _align(extended: CameraFile, known: dict[str, Camera]) -> WorldTransform:
     extent = float(np.linalg.norm(centered_target, axis=1).max(initial=0.0))
     if len(old) < 2 or extent == 0 or not np.linalg.norm(centered_source) > 0:
         raise InputError(
-            f"{extended.source} contains {len(old)} of the {len(known)} images of the scene, the first of which is "
-            f"{next(iter(known))}. Expected at least two at different positions, to align the new cameras. Give a "
+            f"{extended.source} contains {len(old)} of the {len(known)} images of the scene (such as "
+            f"{next(iter(known))}). Expected at least two at different positions, to align the new cameras. Give a "
             "camera file that contains both new and old images."
         )
     u, _, vt = np.linalg.svd(np.einsum("vij,vkj->ik", target[:, :, :3], source[:, :, :3]))

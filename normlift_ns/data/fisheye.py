@@ -22,7 +22,7 @@ MAX_ANGLE = math.radians(80)
 """Angle from the optical axis beyond which pixels are not kept. A pinhole camera cannot show directions near 90
 degrees."""
 _MIN_SHARE = 0.1
-"""Minimum share of pixels within `MAX_ANGLE`. If the share is smaller, the distortion is wrong."""
+"""Minimum share of pixels within `MAX_ANGLE`. If the share is smaller, the distortion is probably wrong."""
 _SAMPLES, _SAMPLING_ERROR = 512, 1e-3
 """Number of rows and of columns of pixels from which shares are estimated, and the error of the estimates."""
 _ANGLES = np.linspace(0, math.radians(89.9), 8192)
@@ -36,7 +36,7 @@ def fisheye_pinhole(lens: Intrinsics) -> Float[np.ndarray, "3 3"]:
     `MAX_ANGLE`, it is the largest one that keeps all others inside.
 
     Raises:
-        ValueError: Hardly any pixel lies within `MAX_ANGLE`.
+        ValueError: Less than a tenth of the pixels lie within `MAX_ANGLE`.
     """
     return np.array(_pinhole(lens).matrix)
 

@@ -97,13 +97,13 @@ def check_mask(mask: Path, file: Path, size: tuple[int, int]) -> None:
 
 
 def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tuple[str, ...]:
-    """Return warnings in whole sentences about images that image viewers and training display differently."""
+    """Return warnings in whole sentences about images that training may not read as expected."""
     kinds = (
         (
             [header.rotated for header in headers],
             "have an EXIF rotation, which training ignores",
-            "They are lifted without this rotation, so queries may miss objects that then lie on their side. To fix "
-            "this, rotate the pixels and train again",
+            "They are lifted without this rotation, so queries may miss objects that lie on their side. To fix this, "
+            "rotate the pixels and train again",
         ),
         (
             [header.mode == "CMYK" for header in headers],
@@ -120,7 +120,8 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
     for affected, problem, advice in kinds:
         if any(affected):
             first = files[affected.index(True)]
-            warnings.append(f"{sum(affected)} of {len(files)} images {problem}; the first is {first}. {advice}.")
+            count = f"{sum(affected)} of {len(files)}"
+            warnings.append(f"Some images {problem} ({count}, the first is {first}). {advice}.")
     return tuple(warnings)
 
 
@@ -211,8 +212,8 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
     """Raise if the cameras of a camera file are not valid.
 
     Raises:
-        ValueError: There are no cameras, a name occurs twice, a pose is not rigid, a number is not finite, or a focal
-            length or size is not positive. Also if only some of the cameras are fisheye cameras.
+        ValueError: The file has no cameras, a name occurs twice, a pose is not rigid, a number is not finite, or a
+            focal length or size is not positive. Also if only some of the cameras are fisheye cameras.
     """
     if len(frames) == 0:
         raise InputError(f"{source} has no cameras with images. Expected a camera for every training image.")
@@ -270,8 +271,8 @@ def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *
     missing = [name for name, file in zip(names, found) if file is None]
     if missing:
         raise FileNotFoundError(
-            f"{len(missing)} of the {len(names)} images in {source} are missing from {folder}; the first is "
-            f"{missing[0]}. Copy them to this folder, or {advice}."
+            f"Images of {source} are missing from {folder} ({len(missing)} of {len(names)}, the first is "
+            f"{missing[0]}). Copy them to this folder, or {advice}."
         )
     files = [file.absolute() for file in found if file is not None]
     check_files_distinct(zip(names, files), "file", f"in the folders that {source} lists, or {advice}")
@@ -288,7 +289,7 @@ def plain_name(name: str) -> str:
 
 
 def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Path]:
-    """Return the possible paths of a file in a camera file, in the order of preference.
+    """Return the possible paths of a file that a camera file names, in the order of preference.
 
     An absolute path may be from another machine, so its trailing parts are also tried in the folder. An example is
     images/1.png for C:\\scene\\images\\1.png.
@@ -296,7 +297,8 @@ def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Pat
     Args:
         folder: Folder to search.
         name: Absolute path, or path relative to the folder.
-        copies: True to omit leading folders of relative paths too, for copies in folders such as images_2.
+        copies: True for a folder of copies, such as images_2, in which leading folders of relative paths may be
+            missing. The absolute path itself is not tried.
     """
     plain = plain_name(name)
     path = PureWindowsPath(plain) if PureWindowsPath(plain).is_absolute() else PurePosixPath(plain)
@@ -308,7 +310,7 @@ def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Pat
 
 
 def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
-    """Return the first existing file of `possible_paths`, or None; copies may have another suffix."""
+    """Return the first existing file of `possible_paths`, or None; the file may have another suffix."""
     for candidate in possible_paths(folder, name, copies=copies):
         for file in (
             *(candidate.with_name(candidate.name + suffix) for suffix in ("", *_SUFFIXES)),
@@ -322,7 +324,7 @@ def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
 def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
     """Find the masks of images, and return their absolute paths.
 
-    The mask of name.jpg is name.jpg.png, as in COLMAP, or an image name with any supported suffix.
+    The mask of name.jpg is name.jpg.png, as in COLMAP, or an image with the same name and any supported suffix.
 
     Raises:
         FileNotFoundError: A mask is missing.
@@ -333,7 +335,7 @@ def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
         mask = _find_file(folder, f"{name}.png", copies=True) or _find_file(folder, name, copies=True)
         if mask is None:
             raise FileNotFoundError(
-                f"There is no mask for {name} in {folder}. Expected {Path(name).name}.png or {Path(name).stem}.png for "
+                f"{folder} has no mask for {name}. Expected {Path(name).name}.png or {Path(name).stem}.png for "
                 "every image."
             )
         masks.append(mask.absolute())

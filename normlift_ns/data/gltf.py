@@ -21,8 +21,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from normlift_ns.core.gaussians import SH_C0
+from normlift_ns.data.compressed_ply import normalize_quats, opacity_logits, to_bytes
 from normlift_ns.data.frames import WorldTransform
-from normlift_ns.data.quantization import normalize_quats, opacity_logits, to_bytes
 from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
 from normlift_ns.data.splat_transforms import transform_splat
 from normlift_ns.data.spz import decode_spz
@@ -249,8 +249,9 @@ def _find_splat(gltf: _Gltf) -> tuple[int, _Primitive]:
     splats = [(index, primitive) for index, primitive in primitives if _EXTENSION in primitive.extensions]
     if len(splats) != 1:
         raise InputError(
-            f"{gltf.path} has {len(splats)} splats ({_EXTENSION}) among its {len(primitives)} primitives, expected "
-            f"one. {'Export the splat, not a mesh.' if len(splats) == 0 else 'Export each splat to a separate file.'}"
+            f"{gltf.path} must have exactly one splat ({_EXTENSION}), found {len(splats)} (primitives of any kind: "
+            f"{len(primitives)}). "
+            f"{'Export the splat, not a mesh.' if len(splats) == 0 else 'Export each splat to a separate file.'}"
         )
     return splats[0]
 
@@ -296,7 +297,9 @@ def _read_accessor(gltf: _Gltf, index: int, name: str, size: int) -> Float[np.nd
     stride = dtype.itemsize * size if view.byte_stride is None else view.byte_stride
     end = accessor.byte_offset + (accessor.count - 1) * stride + dtype.itemsize * size
     if accessor.count < 1 or accessor.byte_offset < 0 or stride < dtype.itemsize * size or end > len(data):
-        raise _damaged(gltf.path, f"{name} has {accessor.count:,} rows, which do not fit into {len(data):,} bytes")
+        raise _damaged(
+            gltf.path, f"the number of rows of {name}, {accessor.count:,}, does not match its {len(data):,} bytes"
+        )
     shape, strides = (accessor.count, size), (stride, dtype.itemsize)
     values = np.ndarray(shape, dtype, data, accessor.byte_offset, strides).astype(np.float32)
     return np.maximum(values / np.iinfo(dtype).max, -1) if accessor.normalized and dtype.kind != "f" else values
@@ -354,7 +357,7 @@ def _buffer_bytes(path: Path, buffer: _Buffer, binary: bytes) -> bytes:
 def encode_glb(
     splat: SplatParameters, columns: Mapping[str, Float[np.ndarray, " n"]], extras: Mapping[str, Any]
 ) -> bytes:
-    """Encode Gaussians as a GLB file, with float32 numbers in their own coordinates.
+    """Encode Gaussians as a GLB file, without changing their coordinates. Numbers are float32, except in COLOR_0.
 
     Args:
         splat: Finite Gaussians. Spherical harmonics of degree 4 are left out.

@@ -37,7 +37,7 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     """Read the cfg.yml of the training run that contains a checkpoint or PLY file.
 
     Returns:
-        The settings, or None if there is no cfg.yml of gsplat's trainer.
+        The settings, or None without a cfg.yml of gsplat's trainer.
     Raises:
         ValueError: If the file is damaged, or the splat was not trained as 3D or 2D Gaussians with pinhole cameras.
     """

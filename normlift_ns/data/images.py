@@ -30,10 +30,10 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, eval_images:
         names: Sorted names of all images.
         test_every: Interval n of held-out images, starting with the first image, as in gsplat's trainer and in Inria's
             trainer with --eval.
-        eval_images: Image names with or without folder and suffix, or a text file with one name per line, or a fraction
-            below 1. For a fraction, the training images are evenly spaced, as in ns-train's data parser.
+        eval_images: Image names with or without folder and suffix, a text file with one name per line, or the fraction
+            of held-out images. For a fraction, the training images are evenly spaced, as in ns-train's data parser.
     Raises:
-        ValueError: A name does not match an image, or both options are given.
+        ValueError: A name does not match exactly one image, a value is invalid, or both options are given.
     """
     if test_every is not None and len(eval_images) > 0:
         raise InputError("--test-every and --eval-images cannot be combined; omit one of them")
@@ -281,11 +281,15 @@ class SplitViews:
             raise FileNotFoundError(
                 f"{error.filename} is missing, but {self._LISTED_IN} lists it. Copy it to this path."
             ) from error
+        except MemoryError:
+            raise
         except Exception as error:  # Pillow's readers and nerfstudio's checks raise any kind of exception
             mask = self._masks[index]
+            advice = (
+                "" if isinstance(error, InputError) else " Expected an 8-bit image; copy it again from the capture."
+            )
             raise InputError(
-                f"{self.files[index]}{'' if mask is None else f' or its mask {mask}'} cannot be read: {error}. "
-                "Expected an 8-bit image; copy it again from the capture."
+                f"{self.files[index]}{'' if mask is None else f' or its mask {mask}'} cannot be read: {error}.{advice}"
             ) from error
         self._check_size(index, image.shape[1::-1])
         return image, mask
@@ -294,11 +298,11 @@ class SplitViews:
 class ImageViews(SplitViews):
     """Lazy `Views` of the images in a camera file; each access reads and undistorts one image.
 
-    Images are undistorted as in nerfstudio's FullImageDatamanager, so stock commands use the same images. The camera
-    matrix becomes OpenCV's optimal one without black borders, and images are cropped to its region of interest. Images
-    of fisheye cameras keep their size, and at least 90 % of their pixels if a pinhole camera can show these (see
-    `fisheye_pinhole`). Their masks are undistorted without interpolation, and are False at pixels that the original
-    image does not show.
+    Images of perspective cameras are undistorted as in nerfstudio's FullImageDatamanager, so stock commands use the
+    same images. The camera matrix becomes OpenCV's optimal one without black borders, and images are cropped to its
+    region of interest. Images of fisheye cameras keep their size, and at least 90 % of their pixels if a pinhole camera
+    can show these (see `fisheye_pinhole`). Their masks are undistorted without interpolation, and are False at pixels
+    that the original image does not show.
 
     Args:
         frames: Image files and their cameras.

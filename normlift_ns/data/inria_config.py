@@ -28,7 +28,7 @@ def find_inria_config(splat: Path) -> InriaConfig | None:
     """Read the cfg_args of the training run that contains a PLY file.
 
     Returns:
-        The settings, or None if there is no cfg_args of Inria's trainer. Missing settings have the trainer's defaults.
+        The settings, or None without a cfg_args of Inria's trainer. Missing settings have the trainer's defaults.
     Raises:
         ValueError: If the file is damaged.
     """

@@ -105,13 +105,13 @@ def explain_misfit(
 ) -> str | None:
     """Return a sentence about a change that makes the renders fit the images; None if no change does.
 
-    Changes of the lens are tried by warping the images, so nothing is rendered.
+    Changes of the lens are tried by warping the images, without new renders.
 
     Args:
         views: Reduced views of the images.
         renders: Render of each view.
-        render_flat: Function that renders a view as 2D Gaussians. If None, the renders are good enough, and only small
-            changes of the lens are tried.
+        render_flat: Function that renders a view as 2D Gaussians. If None, this primitive is not tried, and the search
+            stops if no small change of the lens helps.
         min_psnr: PSNR in dB that the change must reach.
         min_margin: Lead in dB over the PSNR of the mean color that the change must reach.
     """
@@ -194,7 +194,6 @@ def _describe(lens: Lens, views: Sequence[ReducedView]) -> str:
     shifts = (lens.x, "right", "left"), (lens.y, "down", "up")
     pixels = [f"{abs(width * shift):.1f} pixels {more if shift > 0 else less}" for shift, more, less in shifts if shift]
     return (
-        f"A principal point that lies {' and '.join(pixels)} of the present one fits the images {{gain}}. Check "
-        "whether the images were cropped after the training. Inria's trainer puts the principal point at the center "
-        "of the image."
+        f"A principal point that is shifted by {' and '.join(pixels)} fits the images {{gain}}. Check whether the "
+        "images were cropped after the training. Inria's trainer puts the principal point at the center of the image."
     )

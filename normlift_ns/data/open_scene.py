@@ -68,7 +68,7 @@ class SplatScene:
 
     @property
     def gaussians(self) -> GaussianScene:
-        """All N Gaussians, with activated scales and opacities."""
+        """All Gaussians, with activated scales and opacities."""
         return self._gaussians
 
     @cached_property
@@ -134,8 +134,8 @@ def save_splat(folder: Path, scene: SplatScene) -> None:
 def splatfacto_checkpoint(scene: SplatScene) -> dict[str, Any]:
     """Return the content of a checkpoint that splatfacto can load: step and parameters.
 
-    If there is only the constant spherical harmonic, splatfacto would read colors as logits. The function then adds
-    zeros as harmonics of degree 1.
+    If there is only the constant spherical harmonic, the function adds zeros as harmonics of degree 1, because
+    splatfacto would otherwise read colors as logits.
     """
     parameters = scene.parameters
     if scene.splat.degree == 0:
@@ -318,7 +318,7 @@ class StoredRun(NamedTuple):
 
 
 def open_stored_run(load_config: str | Path, data: str | Path | None = None) -> StoredRun:
-    """Open the scene and the field of a lifted run, and warn if files have changed since the lift.
+    """Open the scene and the field of a lifted run, and warn about unusual images and changed cameras.
 
     Args:
         load_config: Path of the config.yml of the run.

@@ -44,14 +44,14 @@ def open_splat(
     device: str = "auto",
     say: Callable[[str], None] = lambda text: None,
 ) -> SplatScene:
-    """Open a trained splat and its images, with the cameras in the world in which the splat fits the images.
+    """Open a trained splat and its images, with the cameras in the world that `SplatOptions.world_transform` selects.
 
     Args:
         path: A plain or compressed PLY file, an SPZ, .splat, GLB or glTF file, or ckpt_<step>_rank<r>.pt of gsplat's
-            simple_trainer. The format is detected from the first bytes. Installed packages may add formats by suffix.
+            simple_trainer. First bytes or suffix determine the format. Installed packages may add formats by suffix.
         options: Paths of the cameras and images, and settings of the splat.
         device: Device of the renders that find the world: auto, cpu or cuda.
-        say: Function that is called with one sentence per assumption, for example `print`.
+        say: Function that is called with a message for each assumption, for example `print`.
     Raises:
         FileNotFoundError: A file or image is missing.
         ValueError: A file cannot be read, does not match the others, or is not a splat.
@@ -142,9 +142,9 @@ def _check_coordinates(
     matrix = f"1 0 0 {-x:.0f}\\n0 1 0 {-y:.0f}\\n0 0 1 {-z:.0f}\\n0 0 0 1\\n"
     place = f" For the cameras, run printf '{matrix}' > offset.txt, and give --world-transform offset.txt."
     raise InputError(
-        f"{what}: the median of the coordinates is ({', '.join(f'{value:.10g}' for value in center)}), as in a UTM "
-        f"zone. The step of float32 is {step:.2g} there, too coarse for Gaussians {width:.2g} wide. Subtract the same "
-        f"offset, such as {x:.0f} {y:.0f} {z:.0f}, from the splat and the cameras. Export the splat with this "
+        f"{what}: the median of the coordinates is ({', '.join(f'{value:.10g}' for value in center)}), far from the "
+        f"origin. There, the step of float32 is {step:.2g}, too coarse for Gaussians {width:.2g} wide. Subtract the "
+        f"same offset, such as {x:.0f} {y:.0f} {z:.0f}, from the splat and the cameras. Export the splat with this "
         f"offset from the program that wrote it.{'' if isinstance(options.world_transform, Path) else place}"
     )
 
@@ -158,7 +158,7 @@ def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None
         names = [frame.name for frame in frames]
         held_out = held_out_names(names, test_every=test_every, eval_images=options.eval_images)
     if len(held_out) == len(frames) and options.views == "train":
-        raise InputError(f"All {len(frames)} images are held out, expected at least one to lift; give --views all.")
+        raise InputError(f"All images are held out ({len(frames)}), expected at least one to lift; give --views all.")
     return held_out
 
 
@@ -218,10 +218,11 @@ def _read(path: Path) -> SplatFile:
         raise
     except Exception as error:  # readers of other packages may raise any exception
         reason = summarize_error(error)
-        raise InputError(f"{path} cannot be read by the installed reader of the format {name!r} ({reason})") from error
+        problem = f"{path} cannot be read by the installed reader of the format {name!r} ({reason})"
+        raise InputError(f"{problem}; fix the package of this reader, or give a PLY file") from error
     if not isinstance(file, SplatFile):
-        kind = type(file).__name__
-        raise InputError(f"the installed reader of the format {name!r} returned {kind}, expected a SplatFile")
+        problem = f"the installed reader of the format {name!r} returned {type(file).__name__}, expected a SplatFile"
+        raise InputError(f"{problem}; fix the package of this reader, or give a PLY file")
     validate_splat(file.splat, path)
     return file
 
@@ -292,7 +293,7 @@ def _format(path: Path) -> str:
     """Detect the format of a file by its first bytes, or else by its suffix; return the key of `SPLAT_READERS`.
 
     Raises:
-        ValueError: The format is known but not supported. The message gives a command that converts the file.
+        ValueError: The path is a folder, or the file is not a splat or has an unsupported format.
     """
     suffix = path.suffix.removeprefix(".")
     if suffix in SPLAT_READERS.names() and suffix not in _SNIFFED:
@@ -368,9 +369,9 @@ def _assumptions(
     )
     if len(held_out) > 0:
         lifted = "lifted too" if options.views == "all" else "not lifted"
-        texts.append(f"{len(held_out)} of {len(frames)} images were held out of the training; they are {lifted}.")
+        texts.append(f"Images held out of the training are {lifted} ({len(held_out)} of {len(frames)} images).")
     else:
-        texts.append(f"All {len(frames)} images are lifted; to hold out some, give --test-every or --eval-images.")
+        texts.append(f"All images are lifted ({len(frames)}); to hold out some, give --test-every or --eval-images.")
     texts += cameras.remarks
     if frames[0].intrinsics.fisheye:
         texts.append(_fisheye_assumption(frames[0]))
@@ -378,7 +379,7 @@ def _assumptions(
         folder = (options.images or options.colmap / "images").absolute()
         unused = len({file for file in folder.rglob("*") if file.is_file()} - {frame.file for frame in frames})
         if unused > 0:
-            texts.append(f"{unused} files in {folder} have no camera and are skipped.")
+            texts.append(f"Files in {folder} that have no camera are skipped (number of files: {unused}).")
     return texts
 
 

@@ -20,16 +20,15 @@ _MAX_SIDE = 400
 _MAX_DIVISOR_AS_TRAINED = 4.0
 """Limit on the divisor of the image size for renders in the trained mode.
 
-Below the limit, a render uses the trained mode, and the rasterizer's blur of 0.3 square pixels is scaled down. With a
-larger divisor, its Gaussians would be too wide. The render is then antialiased, which preserves the mean of Gaussians
-smaller than a pixel.
+Below the limit, a render uses the trained mode, and the rasterizer's blur of 0.3 square pixels is scaled down. Other
+renders are antialiased, which preserves the mean of Gaussians smaller than a pixel.
 """
 _SMALL_EPS2D = 0.1
 """Variance in square pixels that the antialiased renders add to projected Gaussians."""
 
 
 class ReducedView(NamedTuple):
-    """A view with at most 400 pixels on the longer side."""
+    """A view that may be smaller than its image."""
 
     view: View
     divisor: float
@@ -75,6 +74,8 @@ class ReducedView(NamedTuple):
 
 def sample_views(scene: Scene) -> list[ReducedView]:
     """Return the first, the middle and the last training view, with at most 400 pixels on the longer side.
+
+    Views whose mask leaves no pixels are left out.
 
     Raises:
         FileNotFoundError, ValueError: If an image is missing or cannot be read, or the masks leave no pixels.

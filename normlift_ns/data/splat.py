@@ -47,7 +47,7 @@ _MIN_LOGITS = 100
 
 @dataclass(frozen=True)
 class SplatParameters:
-    """Raw parameters of N Gaussians, as trainers store them."""
+    """Raw parameters of Gaussians, as trainers store them."""
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
@@ -87,8 +87,8 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
     """Raise if a rasterizer cannot draw the Gaussians.
 
     Raises:
-        ValueError: There are no Gaussians, values are not finite, all rotations are zero, scales are not logarithms, or
-            opacities are not logits.
+        ValueError: The splat has no Gaussians, values are not finite, all rotations are zero, scales are not
+            logarithms, or opacities are not logits.
     """
     if len(splat) == 0:
         raise InputError(f"{file} contains no Gaussians. Export the scene again.")
@@ -100,9 +100,9 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
         invalid = torch.cat([~block.isfinite().all(dim=1) for block in blocks]).nonzero()
         if len(invalid) > 0:
             raise InputError(
-                f"In {file}, the {name} of {len(invalid):,} of {len(splat):,} Gaussians are NaN or infinite. The first "
-                f"is in row {int(invalid[0])}. Expected finite numbers. For a PLY file, you can remove these Gaussians "
-                f"with: splat-transform {file.name} --filter-nan clean.ply"
+                f"{file} has Gaussians with {name} that are NaN or infinite ({len(invalid):,} of {len(splat):,}, the "
+                f"first is in row {int(invalid[0])}). Expected finite numbers. For a PLY file, you can remove these "
+                f"Gaussians with: splat-transform {file.name} --filter-nan clean.ply"
             )
     lengths = splat.quats.abs().amax(dim=1)
     if bool((lengths == 0).all()):
@@ -131,7 +131,7 @@ def splat_from_parameters(parameters: Mapping[str, Tensor], file: Path) -> Splat
         parameters: Tensors by splatfacto's names.
         file: File of the tensors, for error messages.
     Raises:
-        ValueError: There are no Gaussians, or a tensor has the wrong shape or is not float16, bfloat16, float32 or
+        ValueError: The splat has no Gaussians, or a tensor has the wrong shape or is not float16, bfloat16, float32 or
             float64.
     """
     n = len(parameters["means"]) if parameters["means"].ndim > 0 else 0
@@ -160,21 +160,22 @@ class SplatFile(NamedTuple):
 
     splat: SplatParameters
     rasterize_mode: RasterizeMode | None = None
-    """Rasterize mode of the training; None if the file does not contain it."""
+    """Rasterize mode of the training; None if unknown."""
     step: int = 0
     """Training step; 0 if unknown."""
     pose_adjust: Float[Tensor, "v 9"] | None = None
     """Pose adjustments of the training views by gsplat's --pose_opt: 3 numbers for translation, 6 for rotation."""
     by_gsplat: bool = False
-    """True if gsplat's simple_trainer wrote the file. By default, this trainer normalizes the world of the cameras."""
+    """True if gsplat's simple_trainer wrote the file, and its cfg.yml does not rule out that it normalized the world of
+    the cameras."""
     test_every: int | None = None
-    """Interval n if the training held out every n-th image; None if the file does not contain it."""
+    """Interval n if the training held out every n-th image; None if unknown."""
     remarks: tuple[str, ...] = ()
     """Messages about the file, such as rounding errors of a compressed format."""
     primitive: Primitive | None = None
-    """Kind of the Gaussians; None if the file does not contain it."""
+    """Kind of the Gaussians; None if unknown."""
     clip_planes: tuple[float, float] | None = None
-    """Near and far planes of the training in world units; None if the file does not contain them."""
+    """Near and far planes of the training in world units; None if unknown, or the same as in splatfacto."""
 
 
 _FLATNESS = math.log(1e-3)
@@ -203,7 +204,7 @@ _FILTER = "filter_3D"
 
 
 def check_extra_names(names: Iterable[str], file: Path) -> tuple[str, ...]:
-    """Return a message that lists ignored parameters; an empty tuple if there are none.
+    """Return a tuple with a message that lists ignored parameters; an empty tuple if there are none.
 
     Raises:
         ValueError: A parameter belongs to a primitive other than 3D Gaussians.
@@ -249,7 +250,7 @@ def read_ply(path: Path) -> SplatFile:
     if vertex is None or vertex.count == 0:
         found = ", ".join(f"{element.count:,} {element.name}" for element in data.elements)[:200] or "nothing"
         raise InputError(
-            f"{path} has no Gaussians: expected the element vertex, found {found}. Give the PLY file of a trained "
+            f"{path} has no Gaussians: expected vertices, found the elements {found}. Give the PLY file of a trained "
             "splat."
         )
     mode = _mode([*data.comments, *vertex.comments])
@@ -353,7 +354,7 @@ def _check_properties(path: Path, vertex: PlyElement) -> bool:
     is_2d = missing == ["scale_2"] and _FILTER not in names
     if missing and not is_2d:
         raise InputError(
-            f"{path} is not a splat: its {vertex.count:,} vertices lack {', '.join(missing)}. Expected the properties "
+            f"{path} is not a splat: its vertices lack {', '.join(missing)}. Expected the properties "
             f"x y z, f_dc_*, f_rest_*, opacity, scale_* and rot_*; found "
             f"{', '.join([item for item in sorted(names) if not item.startswith('f_rest_')][:16])}. {_advice(missing)}"
         )
@@ -367,7 +368,7 @@ def check_ply_header(path: Path) -> None:
     """Raise if a PLY file is too small for the rows that its header declares, before memory is allocated for them.
 
     Raises:
-        ValueError: The header is invalid, does not end within 1 MB, or declares more data than the file contains.
+        ValueError: The header is invalid, is longer than 1 MiB, or declares more data than the file contains.
     """
     size = path.stat().st_size
     with open_regular(path) as file:
@@ -386,8 +387,8 @@ def check_ply_header(path: Path) -> None:
         count = words[2] if len(words) == 3 else b""
         if not count.isdigit() or len(count) > 18 or (properties == 0 and int(count) > 0):
             raise InputError(
-                f"{path} is truncated or damaged: its header has the line {b' '.join(words)[:80]!r} with {properties} "
-                "properties. Expected a complete PLY file; copy it again."
+                f"{path} is truncated or damaged: its header has the line {b' '.join(words)[:80]!r} (number of "
+                f"properties: {properties}). Expected a complete PLY file; copy it again."
             )
         declared += int(count) * properties  # each property takes at least one byte
     if declared > size:
@@ -410,7 +411,7 @@ def _rest_names(path: Path, names: set[str]) -> list[str]:
     if count % 3 != 0 or count // 3 not in SH_DEGREES or not set(expected) <= names:
         counts = ", ".join(f"{3 * k} (degree {degree})" for k, degree in SH_DEGREES.items())
         raise InputError(
-            f"{path} has {count} properties f_rest_*, which does not match a degree of spherical harmonics. Expected "
+            f"{path} has properties f_rest_* ({count}) that do not match a degree of spherical harmonics. Expected "
             f"f_rest_0, f_rest_1, … with one of the counts {counts}. Export the scene again."
         )
     return expected

@@ -19,7 +19,7 @@ import zstandard
 from jaxtyping import Float
 from torch import Tensor
 
-from normlift_ns.data.quantization import join_largest, normalize_quats, opacity_logits, split_largest, to_bytes
+from normlift_ns.data.compressed_ply import join_largest, normalize_quats, opacity_logits, split_largest, to_bytes
 from normlift_ns.data.splat import SH_DEGREES, SplatFile, SplatParameters, validate_splat
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import open_regular
@@ -247,7 +247,7 @@ def _fractional_bits(means: Float[Tensor, "n 3"]) -> int:
 
 
 def _bits_of_step(step: float) -> int:
-    """Return the smallest number of fractional bits with steps of at most this length."""
+    """Return the smallest number of fractional bits with steps of at most this length; the largest for length 0."""
     return min(_MAX_FRACTIONAL_BITS, max(0, math.ceil(-math.log2(step)))) if step > 0 else _MAX_FRACTIONAL_BITS
 
 

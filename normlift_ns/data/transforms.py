@@ -100,8 +100,8 @@ class TransformsEntries(CameraEntry, kw_only=True):
     def applied_rows(self, folder: Path) -> list[list[float]] | None:
         """Return the transform that was applied to the poses before they were stored, or None.
 
-        As in nerfstudio, a file without this entry next to colmap/sparse/0 comes from an old ns-process-data, which
-        applied a fixed transform.
+        As in nerfstudio, a file without this entry next to colmap/sparse/0 counts as the output of an old
+        ns-process-data, which applied a fixed transform.
         """
         is_legacy = self.applied_transform is None and (folder / "colmap/sparse/0").exists()
         return _LEGACY_FLIP if is_legacy else self.applied_transform
@@ -157,7 +157,7 @@ def read_transforms_entries(path: Path) -> TransformsEntries:
         if not _is_matrix(frame.transform_matrix):
             raise InputError(
                 f"{path}: the transform_matrix of {frame.file_path} is not valid. Expected a camera-to-world matrix of "
-                "4 x 4 finite numbers."
+                "4 x 4 or 3 x 4 finite numbers."
             )
     return entries
 
@@ -195,7 +195,7 @@ class CameraFile(NamedTuple):
     """Contents of a transforms.json or a COLMAP reconstruction."""
 
     frames: list[Frame]
-    """All images with their cameras in the world of the file, sorted by file."""
+    """All images with their cameras in the world of the file, sorted by file, or by name for COLMAP."""
     held_out: frozenset[str]
     """Names of the images that the file excludes from the training; usually empty."""
     source: Path
@@ -308,7 +308,7 @@ def _listed_masks(entries: TransformsEntries, root: Path, images: Path | None, p
     missing = [name for name, file in zip(names, files) if file is None]
     if missing:
         raise FileNotFoundError(
-            f"{len(missing)} of the {len(names)} masks in {path} are missing; the first is {root / missing[0]}. Copy "
+            f"Masks of {path} are missing ({len(missing)} of {len(names)}, the first is {root / missing[0]}). Copy "
             "them to these paths, or give their folder with --masks."
         )
     return [file.absolute() for file in files if file is not None]
@@ -331,6 +331,7 @@ def _is_named_like(mask: Path, frame: FrameEntry) -> bool:
     return mask.stem in (image.name, image.stem)
 
 
+_UNDISTORT = "Undistort the images, and write a camera file for them in the same coordinate system."
 _SAME = 1e-3
 """Tolerance for equal intrinsics: pixels as a fraction of the longer image side, distortion as an absolute number."""
 
@@ -407,8 +408,7 @@ def _is_fisheye(entries: TransformsEntries, frame: FrameEntry, path: Path) -> bo
     if model not in (*PERSPECTIVE_MODELS, "FULL_OPENCV", "PERSPECTIVE", *FISHEYE_MODELS):
         raise InputError(
             f"{path}: the camera_model of {frame.file_path} is {model}, expected one of "
-            f"{', '.join((*PERSPECTIVE_MODELS, *FISHEYE_MODELS))}. Undistort the images, and give their new cameras in "
-            "the same world."
+            f"{', '.join((*PERSPECTIVE_MODELS, *FISHEYE_MODELS))}. {_UNDISTORT}"
         )
     return model in FISHEYE_MODELS
 
@@ -417,8 +417,7 @@ def _intrinsics(entries: TransformsEntries, frame: FrameEntry, file: Path, path:
     """Return the intrinsics of a frame.
 
     Raises:
-        ValueError: A value is missing or invalid, or values of the file and the frame, or focal lengths and angles of
-            view, differ.
+        ValueError: A value is missing or invalid, or two entries give different values for the same parameter.
     """
     value, source = partial(entries.value, frame), f"{path}: {frame.file_path}"
     is_fisheye = _is_fisheye(entries, frame, path)
@@ -471,8 +470,7 @@ def _distortion(
         name, number = others[0]
         raise InputError(
             f"{source} has the distortion {name} = {number:g}, but only k1, k2, k3"
-            f"{' and k4' if is_fisheye else ', p1 and p2'} are supported. "
-            "Undistort the images, and give their new cameras in the same world."
+            f"{' and k4' if is_fisheye else ', p1 and p2'} are supported. {_UNDISTORT}"
         )
     return k1, k2, k3, p1, p2, k4
 
@@ -539,16 +537,16 @@ def read_dataparser_transforms(path: Path) -> WorldTransform:
     return _to_world(read_json_file(path, _EXPECTED_DATAPARSER), path)
 
 
-def _to_world(values: Any, path: Path) -> WorldTransform:
+def _to_world(values: Any, path: Path, expected: str = _EXPECTED_DATAPARSER) -> WorldTransform:
     try:
         stored = msgspec.convert(values, _DataparserTransforms)
     except (msgspec.ValidationError, RecursionError, OverflowError) as error:
-        raise InputError(f"{path} does not contain a transform ({error}). Expected {_EXPECTED_DATAPARSER}.") from error
+        raise InputError(f"{path} does not contain a transform ({error}). Expected {expected}.") from error
     rows = stored.transform
     if not _is_matrix(rows) or not 0 < stored.scale < _MAX_VALUE:
         raise InputError(
-            f"{path} does not contain a transform: {len(rows)} rows and scale {stored.scale:g}, expected 3 rows of 4 "
-            f"finite numbers and a positive scale. Give {_EXPECTED_DATAPARSER}."
+            f"{path} does not contain a valid transform (rows: {len(rows)}, scale: {stored.scale:g}). Expected 3 rows "
+            f"of 4 finite numbers and a positive scale, as in {expected}."
         )
     return WorldTransform(np.array(rows[:3]), stored.scale)
 
@@ -565,7 +563,8 @@ def capture_transforms(run_dir: Path, identity: Mapping[str, Any]) -> tuple[Worl
     """
     trained = read_dataparser_transforms(run_dir / "dataparser_transforms.json")
     source = identity.get("source_world")
-    return (trained,) if source is None else (_to_world(source, run_dir / "splat.json"), trained)
+    file, expected = run_dir / "splat.json", "the splat.json that ns-normlift wrote; copy the whole run again"
+    return (trained,) if source is None else (_to_world(source, file, expected), trained)
 
 
 def read_world_transform(
@@ -627,7 +626,7 @@ def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World
     """
     if matrix.shape != (4, 4) or not (np.abs(matrix) < _MAX_VALUE).all():
         raise InputError(
-            f"{source} has the shape {matrix.shape}, or numbers that are not finite. Expected {_EXPECTED_MATRIX}."
+            f"{source} has the shape {matrix.shape}, or numbers that are not finite. Expected 4 x 4 finite numbers."
         )
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))

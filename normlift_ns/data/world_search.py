@@ -135,7 +135,7 @@ class _Search:
         return _Motion(candidate.matrix @ self._back, candidate.opencv_cameras != self._flipped)
 
     def agreement(self, candidates: Sequence[CandidateWorld]) -> Float[Tensor, " w"]:
-        """Return how well points of the splat agree with the images in each world, in -1..1."""
+        """Return the mean correlation of points of the splat with the images in each world, in -1..1."""
         return self._points.agreement([self._motion(candidate) for candidate in candidates])
 
     def likely(self, candidates: Sequence[CandidateWorld]) -> list[CandidateWorld]:
@@ -175,7 +175,7 @@ class _Search:
         return small._replace(view=small.view._replace(camera=camera)).render(self._scene, self._gaussians, settings)
 
     def _refine(self, candidate: CandidateWorld, log: float) -> float | None:
-        """Return the logarithm of the scale that fits best, near a first guess; None if its render is not similar.
+        """Return the logarithm of the scale that fits best, near a first guess; None if a render does not fit an image.
 
         Points refine the guess to a few percent. Parabolas through the mean squared errors of renders of one view then
         refine it further.
@@ -242,8 +242,7 @@ def _draw_points(scene: SplatScene, views: Sequence[ReducedView]) -> _Points:
 def _is_best_nearby(scene: SplatScene, device: str) -> bool:
     """Return True if the images fit worse after any rotation of the world by one degree about an axis.
 
-    A world that is only close to the correct one can reach the usual PSNR, but then one of the rotations improves the
-    fit.
+    A world that is only close to the correct one can reach the usual PSNR, but one of the rotations improves its fit.
     """
     gaussians, settings = scene.gaussians.to(device), RasterSettings.recorded(scene.identity)
     views = [view.reduced(_TURNED_SIDE) for view in sample_views(scene)]
@@ -278,7 +277,7 @@ def find_world(
     device: str,
     say: Callable[[str], None],
 ) -> SplatScene:
-    """Return the scene in the world in which its renders reach the usual PSNR.
+    """Search for the world in which renders of the scene reach the usual PSNR, and return the scene in this world.
 
     If the first world fits, no other world is tried. Otherwise, the result is the scene in the only other world that
     fits, or in the first world if none or several fit.
@@ -287,7 +286,7 @@ def find_world(
         candidates: Possible worlds.
         scene_in: Function that returns the scene in a world.
         device: torch device to render on.
-        say: Function that is called with a sentence if another world fits.
+        say: Function that is called with a message if other worlds fit.
     """
     here = candidates[0]
     scene = scene_in(here)

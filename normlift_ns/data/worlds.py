@@ -91,7 +91,7 @@ def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile
     OpenCV's axes.
 
     Raises:
-        FileNotFoundError, ValueError: If the world that the options state cannot be read or computed.
+        FileNotFoundError, ValueError: If the world that the options or files state cannot be read or computed.
     """
     if isinstance(options.world_transform, Path):
         world = read_world_transform(options.world_transform, cameras.applied_transform, cameras.applied_scale)
@@ -138,9 +138,9 @@ def _gsplat_world(options: SplatOptions, cameras: CameraFile) -> CandidateWorld:
         raise FileNotFoundError(f"gsplat's trainer normalized the world with points3D. {error}") from error
     if len(points) < _MIN_POINTS:
         raise InputError(
-            f"{cameras.source} has {len(points)} points, too few to recompute the normalization of gsplat's trainer. "
-            "Give the project that the splat was trained with, or --gsplat-normalize False if the training used "
-            "--no-normalize-world-space."
+            f"{cameras.source} has too few points ({len(points)}, expected at least {_MIN_POINTS}) to recompute the "
+            "normalization of gsplat's trainer. Give the project that the splat was trained with, or "
+            "--gsplat-normalize False if the training used --no-normalize-world-space."
         )
     return CandidateWorld("gsplat's normalized world", gsplat_normalization(cameras.frames, points))
 

@@ -56,7 +56,7 @@ _FAINT_OPACITIES = (0.001, 0.1)
 
 @dataclass(frozen=True)
 class DemoRoom:
-    """A room of N Gaussians with known colors and classes."""
+    """A room of Gaussians with known colors and classes."""
 
     scene: GaussianScene
     """Gaussians in float32 and meters; z points up."""

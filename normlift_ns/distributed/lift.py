@@ -15,21 +15,15 @@ import torch
 from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
-from normlift_ns import api, pipeline
+from normlift_ns import pipeline
 from normlift_ns.core import lowrank
-from normlift_ns.core.consensus import (
-    Consensus,
-    check_consensus_inputs,
-    sample_gaussians,
-    sampled_consensus,
-)
+from normlift_ns.core.consensus import Consensus, check_consensus_inputs, sample_gaussians, sampled_consensus
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField, choose_form
-from normlift_ns.core.gate import sample_pairs, shared_region_cosines
 from normlift_ns.core.lift import Lifted
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.partition import Communicator, Partition
-from normlift_ns.core.refine import decay_width, labeled_share, refine_subset
+from normlift_ns.core.refine import decay_width, labeled_share, refine_subset, sample_pairs, shared_region_cosines
 from normlift_ns.distributed.communicator import (
     EvidenceShard,
     TorchCommunicator,
@@ -45,19 +39,19 @@ from normlift_ns.options import LiftOptions
 from normlift_ns.progress import StageTimer
 
 
-def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> LiftedRun | None:
+def run_lift_distributed(team: TorchCommunicator, request: pipeline.LiftRequest) -> LiftedRun | None:
     """Run `run_lift` in several processes, each with the same request and the whole scene.
 
     Only process 0 writes and returns the run. All other processes return None.
     """
-    prepared, before = api.prepare_lift(request), StageTimer(request.report)
+    prepared, before = pipeline.prepare_lift(request), StageTimer(request.report)
     run_dir = prepared.run_dir.with_name(team.broadcast_object(prepared.run_dir.name))  # clocks differ
     prepared = replace(prepared, run_dir=run_dir)
     if team.rank == 0:
-        api.check_target(prepared)
-    api.announce(prepared)
+        pipeline.check_target(prepared)
+    pipeline.announce(prepared)
     if team.rank == 0:
-        api.check_alignment(prepared, before, lambda: None)
+        pipeline.check_alignment(prepared, before, lambda: None)
     cache, device = cache_folder(run_dir), prepared.device
     collection = pipeline.plan_collection(
         prepared.scene, prepared.source, prepared.lift, cache, device=device, export=request.export
@@ -102,7 +96,7 @@ def run_lift_distributed(team: TorchCommunicator, request: api.LiftRequest) -> L
         return None
     field = pipeline.add_null_level(field, collection, prepared.encoder)
     result = pipeline.LiftResult(pipeline.with_cost(field, stages, device), stages.seconds)
-    return api.write_lifted_run(prepared, result, before)
+    return pipeline.write_lifted_run(prepared, result, before)
 
 
 def _collect(

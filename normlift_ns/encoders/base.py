@@ -1,9 +1,8 @@
-"""Protocols of feature sources, segmentation methods and encoders, and sources of patch and precomputed features.
+"""Protocols of feature sources, segmentation methods and encoders, with the classes that implement feature sources.
 
 Segmentation and encoding are separate steps. `Regions` segments an image, and an `Encoder` embeds regions and prompts
-in a joint space. `RegionFeatures` combines the two into a `FeatureSource`, the only protocol that the rest of the
-package uses. A source that reads labels and features together, such as an importer, implements `FeatureSource`
-directly.
+in a joint space. `RegionFeatures` combines the two into a `FeatureSource`, the protocol that the lift uses. A source
+that reads labels and features together, such as an importer, implements `FeatureSource` directly.
 
 An image can be segmented at several levels. The rasterizer computes evidence once, for the cells that all levels share
 (see `joint_partition`). The lift then sums the evidence over the regions of the selected levels.
@@ -47,12 +46,12 @@ class ViewFeatures:
     """
 
     labels: Int32[Tensor, "h w"]
-    """Cell of each pixel, in 0..C-1, or -1 for none."""
+    """Cell of each pixel, in 0..C-1 for C cells, or -1 for none."""
     features: Float32[Tensor, "r d"]
     """Feature of each region, a unit vector."""
     regions: Int32[Tensor, "levels c"] | None = None
-    """Region of each cell in each selected level, in 0..R-1, or -1 if the cell is unlabeled. Each pixel counts once in
-    each level. None: each cell is a region."""
+    """Region of each cell in each selected level, a row of `features`, or -1 if the cell is unlabeled. Each pixel
+    counts once in each level. None: each cell is a region."""
 
     def __post_init__(self) -> None:
         for name, dtype in (("labels", torch.int32), ("features", torch.float32), ("regions", torch.int32)):
@@ -71,9 +70,9 @@ class ViewFeatures:
         if bad.numel() > 0:
             first = int(bad[0])
             raise InputError(
-                f"{bad.numel()} of {len(self.features)} rows of ViewFeatures.features are not unit vectors (row "
-                f"{first} has length {length[first]:.3g}); normalize them, and use the label -1 for regions without a "
-                "feature"
+                f"each row of ViewFeatures.features must be a unit vector, but row {first} has length "
+                f"{length[first]:.3g} (rows with wrong lengths: {bad.numel()} of {len(self.features)}); normalize "
+                "them, and use the label -1 for regions without a feature"
             )
 
     @property
@@ -86,7 +85,7 @@ def _check_range(name: str, values: Tensor, count: int, unit: str) -> None:
     """Raise InputError if a value is not in -1..count-1."""
     if values.numel() > 0 and not -1 <= int(values.min()) <= int(values.max()) < count:
         raise InputError(
-            f"ViewFeatures.{name} must be in -1..{count - 1} (there are {count} {unit}s), found "
+            f"ViewFeatures.{name} must be in -1..{count - 1} (number of {unit}s: {count}), found "
             f"{int(values.min())}..{int(values.max())}"
         )
 
@@ -255,7 +254,8 @@ class RegionFeatures:
         chosen = self.regions.chosen or (0,) * (len(maps) == 1)
         if len(chosen) == 0 or max(chosen) >= len(maps):
             origin = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
-            raise InputError(f"{origin} has {len(maps)} levels of regions, 0..{len(maps) - 1}; select one with --level")
+            levels = "only level 0" if len(maps) == 1 else f"the levels 0..{len(maps) - 1}"
+            raise InputError(f"{origin} has {levels}; select a level of the regions with --level")
         return image, maps if self.filled is None else _limit_regions(maps, self.filled(name, *image.shape[:2]))
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
@@ -319,7 +319,7 @@ def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h
     Args:
         maps: Region of each pixel in each level, or -1 for none.
     Returns:
-        The cell of each pixel, and the region of each cell in each level. Cells have consecutive ids 0..C-1. Pixels
+        The cell of each pixel, and the region of each cell in each level. Cells have consecutive ids from 0. Pixels
         that are unlabeled in all levels have the cell -1, and cells without a region in a level have -1. For one level
         with consecutive ids, cells equal regions.
     """
@@ -345,7 +345,10 @@ def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h
 
 
 def _renumber(key: Int64[Tensor, "h w"], key_count: int) -> tuple[Int64[Tensor, "h w"], int]:
-    """Map keys in 0..key_count-1 to 0..C-1 in ascending order; return the mapped keys and C."""
+    """Replace each key by its rank among the distinct keys, from 0; return the ranks and the number of distinct keys.
+
+    Keys are in 0..key_count-1.
+    """
     if key_count > 8 * key.numel():
         values, number = key.unique(return_inverse=True)
         return number, len(values)
@@ -370,7 +373,8 @@ class DenseEncoder(Encoder, Protocol):
         """Return one unit vector or zero row per patch of a grid over the image, in row-major order.
 
         Raises:
-            FileNotFoundError, ValueError: For the same reasons as `Encoder.encode`.
+            FileNotFoundError: If the weights are not available.
+            ValueError: If the weight file is damaged or of a different architecture.
         """
         ...
 
@@ -416,7 +420,7 @@ class PatchFeatures:
         """Return one unit vector per patch, or a zero row if the patch has no feature.
 
         Raises:
-            FileNotFoundError: If the weights cannot be downloaded.
+            FileNotFoundError: If the weights are not available.
             ValueError: If the image is invalid, or the weight file is damaged or of a different architecture.
             MemoryError: If the image does not fit into the memory of the device.
         """
@@ -456,8 +460,8 @@ class PrecomputedFeatures:
     """A `FeatureSource` of precomputed labels, region features and prompt embeddings, on the CPU."""
 
     views: Mapping[str, tuple[Int[Tensor, "h w"], Float[Tensor, "r d"]]]
-    """Labels and vectors by image name. Labels are in 0..R-1, or -1 for none. Vectors can have any norm; a zero vector
-    stands for no feature."""
+    """Labels and vectors by image name. Labels are rows of the vectors, or -1 for none. Vectors can have any norm; a
+    zero vector stands for no feature."""
     texts: Mapping[str, Float[Tensor, " d"]]
     """Embedding of each prompt."""
     divisor: int = 1
@@ -477,8 +481,8 @@ class PrecomputedFeatures:
         unknown = sorted(set(self.views) - set(names))
         if len(unknown) > 0:
             raise InputError(
-                f"features has an entry for {unknown[0]!r}, which is not a training image; use the {len(names)} names "
-                f"in scene.train.names, from {names[0]!r} to {names[-1]!r}"
+                f"features has an entry for {unknown[0]!r}, which is not a training image; use the names in "
+                f"scene.train.names, such as {names[0]!r}"
             )
         return [name for name in names if name in self.views]
 
@@ -513,7 +517,7 @@ def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: 
         ValueError: If labels are not an integer matrix, or contain the id of a region without a vector.
         ValueError: If vectors are not finite or not [regions, D], with the same D for all images and prompts.
         ValueError: If the vector of a prompt is not [D], not finite or zero.
-        ValueError: If a prompt is empty, or cannot be a file name in an archive.
+        ValueError: If a prompt is empty, ends in .npy or contains invalid characters.
     """
     if not isinstance(features, Mapping | Sequence) or isinstance(features, str):
         raise InputError(
@@ -522,8 +526,9 @@ def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: 
     if not isinstance(features, Mapping):
         if len(features) != len(names):
             raise InputError(
-                f"{len(features)} pairs of labels and vectors were given for {len(names)} training images; pass one "
-                "pair per image in the order of scene.train.names, or a dictionary with those names as keys"
+                "features must have one pair of labels and vectors per training image (number of images: "
+                f"{len(names)}), got {len(features)}; pass the pairs in the order of scene.train.names, or a "
+                "dictionary with those names as keys"
             )
         features = dict(zip(names, features))
     if len(features) == 0:

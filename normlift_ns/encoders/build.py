@@ -51,7 +51,7 @@ def _make_masks(options: SourceOptions, name: str, device: str) -> Any:
 
 
 _PATHS = ("regions_dir", "features_dir", "text_embeddings")
-"""Names of options that are paths."""
+"""Names of options of type `Path`."""
 
 
 def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, Any]:
@@ -73,7 +73,7 @@ def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureS
     Raises:
         ValueError: If the manifest has no feature options, because features were passed from Python or an older
             version lifted the run.
-        ValueError: If the recorded options now give different features.
+        ValueError: If the recorded options now give different features, or this version does not support them.
         FileNotFoundError: If a recorded file no longer exists.
     """
     settings = manifest.get("source")

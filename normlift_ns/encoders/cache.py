@@ -27,7 +27,7 @@ from normlift_ns.io.arrays import load_arrays, save_arrays
 from normlift_ns.io.guard import read_file
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
 
-REMEDY = "lift again with the same options: ns-normlift"
+REMEDY = "copy it from where the scene was lifted, or lift again with the same options: ns-normlift"
 
 
 class NotCachedError(InputError):
@@ -87,7 +87,7 @@ class CachedRegions(_Cached):
         return labels.int()
 
     def prepare(self) -> None:
-        """Prepare the segmentation if no label maps are cached."""
+        """Prepare the segmentation if the cache folder does not exist."""
         if not self.folder.exists():
             self.inner.prepare()
 
@@ -211,7 +211,7 @@ def _read(
         if tensor is not None and is_valid(tensor):
             return tensor
     if not compute:
-        raise NotCachedError(f"{path.parent} no longer contains the {path.parent.name} of {image}; {REMEDY}")
+        raise NotCachedError(f"the cache {path.parent.parent} lacks the {path.parent.name} of {image}; {REMEDY}")
     return None
 
 

@@ -14,8 +14,9 @@ decreases with the distance between their coordinates::
 
 The cosine is 0.95 at a distance of 10 (neighboring shades), 0.61 at 30, 0.14 at 60 and 0.004 at 100. An exact phi would
 need infinitely many dimensions. This module uses the Nystroem approximation on 343 anchors, a lattice of 7 levels per
-sRGB channel. If L L^T is the kernel matrix of the anchors, phi(x) is the normalized vector L^-1 k(anchors, x). For
-random pairs of sRGB colors, cosines are accurate to 4e-3, and for 99 % of the pairs to 1e-3.
+sRGB channel. If L L^T is the kernel matrix of the anchors, and k contains the kernel values of x and each anchor,
+phi(x) is the normalized vector L^-1 k. For random pairs of sRGB colors, cosines are accurate to 4e-3, and for 99 % of
+the pairs to 1e-3.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 KERNEL_SIGMA = 30.0
 """Width of the kernel, in units of `shading_coordinates`."""
 _STRONG_CHROMA = 40.0
-"""Chroma, in units of `shading_coordinates`, above which a color counts as strong."""
+"""Divisor of the chroma in the exponential of the module docstring, in units of `shading_coordinates`."""
 _LEVELS = 7
 _LEVEL_POWER = 1.5
 """Exponent of the sRGB levels of the anchors. Values above 1 make the lattice denser for dark colors, whose coordinates
@@ -114,9 +115,7 @@ def _mean_lab(view: tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]) -
 def _unique_lab(image: UInt8[np.ndarray, "h w 3"]) -> tuple[Float64[np.ndarray, "colors 3"], Int64[np.ndarray, " p"]]:
     """Return the CIELAB values of the distinct colors of an image, and the row of the color of every pixel.
 
-    Pixels are in row-major order.
-
-    An image has several pixels of each color, and the conversion takes most of the time of the encoder.
+    Pixels are in row-major order. Each color is converted once, because conversions take most of the encoder's time.
     """
     from skimage.color import rgb2lab  # noqa: PLC0415 (other encoders do not need it)
 

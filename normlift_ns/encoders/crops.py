@@ -1,9 +1,9 @@
 """Encoders that embed masked square crops of regions with a joint image-text network.
 
 As in LangSplat, pixels outside a region are filled, and the image is cropped to the bounding box of the region. The
-crop is then padded with black to a centered square and resized bilinearly. LangSplat fills with black. LaGa and SFS
-fill with white, and also pad with black. LangSplat's boxes come from SAM and omit the last row and column of a mask;
-the boxes of this module include them.
+crop is then padded with black to a centered square and resized bilinearly. LangSplat fills with black. LaGa and Splat
+Feature Solver fill with white, and also pad with black. LangSplat's boxes come from SAM and omit the last row and
+column of a mask; the boxes of this module include them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from normlift_ns.encoders.text_files import check_prompts, check_template, promp
 from normlift_ns.options import CropFill
 
 _GPU_BATCH, _BATCH = 128, 8
-"""Number of crops or texts per batch, on a GPU and on a CPU."""
+"""Largest number of crops or texts per batch on a GPU, and on a CPU."""
 
 
 class JointNetwork(Protocol):
@@ -34,7 +34,7 @@ class JointNetwork(Protocol):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the training images, in pixels."""
+        """Height and width of the images that `images` embeds, in pixels."""
         ...
 
     @property
@@ -153,7 +153,7 @@ class NetworkEncoder(ABC):
         """Return one unit vector per prompt.
 
         Raises:
-            ValueError: If `prompts` or a prompt is empty.
+            ValueError: If `prompts` or a prompt is empty, or the network ignores all characters of a prompt.
             FileNotFoundError, ValueError, MemoryError: For the same reasons as `encode`.
         """
         check_prompts(prompts)

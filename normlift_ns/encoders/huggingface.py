@@ -218,8 +218,9 @@ def _sizes(values: object, where: str) -> dict[str, Any]:
         value = values.get(key)
         if value is None:
             continue
-        if type(value) is not int or not (0 if key.endswith("_id") else 1) <= value <= maximum:
-            raise InputError(f"{key} of {where} is {value!r:.40}, expected an integer up to {maximum:,}")
+        minimum = 0 if key.endswith("_id") else 1
+        if type(value) is not int or not minimum <= value <= maximum:
+            raise InputError(f"{key} of {where} is {value!r:.40}, expected an integer in {minimum}..{maximum:,}")
         sizes[key] = value
     if (activation := values.get("hidden_act")) is not None:
         if activation not in _ACTIVATIONS:
@@ -257,9 +258,9 @@ def _pixels(path: Path, family: ModelFamily, kind: str) -> PixelNormalization:
         std = _channels(settings, "image_std", family.std, 1e-6, file)
     if kind != "siglip2":
         return PixelNormalization(factor, mean, std, _side(settings), None)
-    patches = settings.get("max_num_patches", 256)
-    if type(patches) is not int or not 1 <= patches <= _MAX_SIZES["num_patches"]:
-        raise InputError(f"max_num_patches of {file} is {patches!r:.40}, expected a positive integer")
+    patches, most = settings.get("max_num_patches", 256), _MAX_SIZES["num_patches"]
+    if type(patches) is not int or not 1 <= patches <= most:
+        raise InputError(f"max_num_patches of {file} is {patches!r:.40}, expected an integer in 1..{most:,}")
     return PixelNormalization(factor, mean, std, None, patches)
 
 
@@ -293,8 +294,8 @@ def _tokens(path: Path, family: ModelFamily) -> TokenPadding:
     owner = family_of_tokenizer(name) if isinstance(name, str) else None
     if owner is not None and owner != family:
         raise InputError(
-            f"its tokenizer {truncate_text(str(name))} belongs to {owner.title}, not to {family.title}; use "
-            f"--encoder {owner.name}"
+            f"its tokenizer {truncate_text(str(name))} belongs to {owner.title} (--encoder {owner.name}), not to "
+            f"{family.title}"
         )
     pad = settings.get("pad_token") or family.pad_token
     pad = pad.get("content") if isinstance(pad, Mapping) else pad
@@ -354,7 +355,8 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
     Raises:
         InputError: If packages are missing or too old, an option applies only to another encoder, or the folder has
             a different architecture.
-        FileNotFoundError: If the folder does not exist, or the network cannot be downloaded.
+        FileNotFoundError: If the folder does not exist, or the network is not on this machine and the hub cannot be
+            reached.
     """
     check_transformers_version(family)
     if options.encoder_pretrained != DEFAULT_PRETRAINED:
@@ -379,14 +381,15 @@ def check_model_name(model: str, family: ModelFamily) -> None:
         InputError, FileNotFoundError: If it is neither.
     """
     example = (
-        f"give a folder with {CONFIG_FILE}, {WEIGHTS_FILE} and tokenizer.json, or a name such as {family.default_model}"
+        f"give a folder with {CONFIG_FILE}, {WEIGHTS_FILE}, {TOKENIZER_FILE} and {_PREPROCESSING_FILES[0]}, or a name "
+        f"such as {family.default_model}"
     )
     if not os.path.isdir(model):
         weights.check_not_local(model, 2, "--encoder-model", "not a folder", example)
 
 
 def find_local_model(model: str) -> Path | None:
-    """Return the local folder of a network, possibly in the hub cache, or None if it is missing or incomplete."""
+    """Return the folder, if `model` is one, or the network's folder in the hub cache; None if it is not cached."""
     files = (WEIGHTS_FILE, WEIGHTS_INDEX_FILE)
     return Path(model).resolve() if os.path.isdir(model) else weights.find_cached_model(model, files)
 
@@ -396,7 +399,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 
     Raises:
         FileNotFoundError: If the network is not on this machine and cannot be downloaded.
-        InputError: If the network has a different architecture.
+        InputError: If the network to download has a different architecture.
     """
     local = find_local_model(model)
     if local is not None:

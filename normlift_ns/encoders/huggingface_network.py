@@ -49,7 +49,7 @@ class HuggingFaceNetwork:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the training images, in pixels."""
+        """Height and width of the images that `images` embeds, in pixels."""
         config, count = self.model.config.vision_config, self.folder.pixels.max_patches
         side = config.image_size if count is None else math.isqrt(count) * config.patch_size
         return side, side
@@ -257,8 +257,7 @@ class HuggingFaceEncoder(NetworkEncoder):
         text = self.family.preprocess_text(text)
         if not text.strip():
             raise InputError(
-                f"prompt {prompt!r} has no letters or digits, and {self.family.title} ignores all other characters; "
-                "use words"
+                f"prompt {prompt!r} consists only of punctuation, which {self.family.title} ignores; use words"
             )
         return text
 

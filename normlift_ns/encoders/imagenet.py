@@ -28,8 +28,8 @@ _AFTER_HEAD = re.compile(r"\b(?:of|on|in|with|at|under|by|near|behind|from|for|t
 def find_classes(prompt: str) -> list[int]:
     """Return the classes that a prompt names, in ascending order.
 
-    The longest known phrase at the end of the prompt counts. Articles, adjectives and everything after a preposition
-    are ignored.
+    If the whole prompt is not known, everything from the first preposition or relative pronoun on is ignored. Of the
+    rest, the longest known phrase at the end counts.
 
     >>> find_classes("A red fox"), find_classes("two foxes in the snow"), find_classes("cup of tea")
     ([277], [277, 278, 279, 280], [968])
@@ -45,8 +45,8 @@ def find_classes(prompt: str) -> list[int]:
     near += [name for word in (text, *text.split()) for name in difflib.get_close_matches(word, _vocabulary())]
     suggestions = ", ".join(list(dict.fromkeys(near))[:6] or ["dog", "chair", "vehicle"])
     raise InputError(
-        f"prompt {truncate_text(prompt)!r} is not the name of an ImageNet class or of a group of classes. Words with a "
-        f"similar spelling are {suggestions}; use one of them, or lift with --encoder open_clip for other words"
+        f"prompt {truncate_text(prompt)!r} is not the name of an ImageNet class or of a group of classes. Use a name "
+        f"such as {suggestions}, or lift with --encoder open_clip for other words"
     )
 
 

@@ -3,7 +3,7 @@
 The classifier averages 1,280 feature maps over an image and multiplies the mean by one vector per class. The encoder
 normalizes the features and averages them over a region, so that all pixels count equally. The cosine of this mean and a
 class vector measures how much the region looks like the class. Features are 32 pixels apart, so the image is encoded at
-twice its size.
+twice its size, or at about 2,048 pixels on its longer side if that is less.
 
 Convolutions are padded equally on both sides, so that feature (i, j) is centered on pixel (32 i, 32 j). An image with
 32 m + 1 rows has m + 1 rows of features, from its first to its last row. TensorFlow, which was used for training, pads
@@ -45,7 +45,7 @@ _EPSILON = 1e-3
 _STRIDE = 32
 """Distance between features, in pixels."""
 _SCALE, _MAX_SIDE = 2.0, 2048
-"""Scale factor of images, and their largest side after scaling, in pixels."""
+"""Largest scale factor of images, and approximate limit on their longer side after scaling, in pixels."""
 
 
 def _convolution(inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> nn.Conv2d:

@@ -90,17 +90,17 @@ def read_segment_map(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
         )
     if segments.dtype.kind == "f" and segments.dtype.itemsize == 2 and bool((values >= _MAX_EXACT_HALF).any()):
         raise InputError(
-            f"segment map {path} is float16 and has ids of {_MAX_EXACT_HALF} or more, which float16 rounds; save it "
-            "as float32"
+            f"segment map {path} is float16 and has ids of {_MAX_EXACT_HALF} or more, which float16 rounds; preprocess "
+            "the image again, and save the ids as float32"
         )
     past = values >= rows
-    for invalid, problem in ((~finite, "that are not finite"), (past, f"past the {rows} rows of its table")):
+    for invalid, problem in ((~finite, "that are not finite"), (past, "past the end of its table")):
         if invalid.any():
             channels = shorten_list(np.flatnonzero(invalid.any(axis=(1, 2))).tolist())
             ids = shorten_list([f"{value:g}" for value in np.unique(segments[invalid])])
             warnings.warn(
-                f"segment map {path}: channels {channels} have ids {problem} ({ids}), in {int(invalid.sum())} pixels; "
-                "these pixels are treated as unlabeled",
+                f"segment map {path} has ids {problem} (ids: {ids}; channels: {channels}; pixels: "
+                f"{int(invalid.sum())}); such pixels are treated as unlabeled",
                 stacklevel=2,
             )
     return np.where(past | (values < 0), -1, values).astype(np.int32)
@@ -115,8 +115,9 @@ def open_feature_table(path: Path) -> np.ndarray:
     table = read_npy(path, "feature table")
     if table.dtype.kind != "f" or table.ndim != 2 or table.shape[1] < _MIN_DIMENSION:
         raise InputError(
-            f"feature table {path} is {table.dtype} {table.shape}, expected floats [T, D], one CLIP vector per "
-            "mask. If these are autoencoder codes (language_features_dim3), give the folder language_features instead"
+            f"feature table {path} is {table.dtype} {table.shape}, expected floats [masks, D] with D >= "
+            f"{_MIN_DIMENSION}, one CLIP vector per mask. If these are autoencoder codes (language_features_dim3), "
+            "give the folder language_features instead"
         )
     return table
 
@@ -124,7 +125,7 @@ def open_feature_table(path: Path) -> np.ndarray:
 def read_feature_table(path: Path) -> tuple[Float32[Tensor, "t d"], Bool[Tensor, " t"]]:
     """Read a feature table as unit vectors, with a mask of valid rows; invalid rows are zero.
 
-    Rows that already have unit length are kept bit for bit. Raises the same errors as `open_segment_map`.
+    Rows that already have unit length are not scaled again. Raises the same errors as `open_feature_table`.
     """
     table = torch.from_numpy(np.array(open_feature_table(path), dtype=np.float64))
     length = torch.linalg.vector_norm(table, dim=1)
@@ -199,7 +200,8 @@ class LangSplat:
     texts: TextEncoder
     """Text encoder of the model that computed the features."""
     level: LangSplatLevel = "l"
-    """Channel to use, or "sum" for the sum of the vectors of all channels at each pixel, as in Splat Feature Solver."""
+    """Channel to use, or "sum" for the sum of the vectors of all channels at each pixel, as in Splat Feature Solver. A
+    map with one channel is used as it is."""
     missing: MissingFeatures = "error"
     """Handling of images without features: "error" raises an error, "skip" skips them with a warning."""
     resample: bool = False
@@ -238,11 +240,12 @@ class LangSplat:
                 files_of[name] = self._files(name)
         absent = [name for name in names if name not in files_of]
         if len(absent) > 0:
-            problem = f"{len(absent)} of {len(names)} images have no features in {self.folder}: {', '.join(absent)}"
+            problem = f"no features in {self.folder} for {len(absent)} of {len(names)} images: {shorten_list(absent)}"
             if self.missing == "error" or len(files_of) == 0:
+                remedy = "give another folder with --features-dir"
+                remedy = "skip them with --features-missing skip" if len(files_of) > 0 else remedy
                 raise FileNotFoundError(
-                    f"{problem}. Expected <name>_s.npy and <name>_f.npy for each; preprocess these images, or skip "
-                    "them with --features-missing skip"
+                    f"{problem}. Expected <name>_s.npy and <name>_f.npy for each; preprocess these images, or {remedy}"
                 )
             warnings.warn(f"{problem}; the lift skips these images", stacklevel=2)
         maps = ((name, files.segments) for name, files in files_of.items())
@@ -273,8 +276,8 @@ class LangSplat:
         invalid = rows[(rows >= 0) & ~valid[rows.long()]].unique().tolist()
         if len(invalid) > 0:
             warnings.warn(
-                f"{files.features}: rows {shorten_list(invalid)} of the table are zero or not finite; their pixels "
-                "are treated as unlabeled",
+                f"{files.features} has rows that are zero or not finite: {shorten_list(invalid)}; their pixels are "
+                "treated as unlabeled",
                 stacklevel=2,
             )
             rows = torch.where(valid[rows.long()], rows, -1)
@@ -308,8 +311,8 @@ class LangSplat:
         if not self.resample and not is_same_image(maps.shape[2], maps.shape[1], width, height):
             raise InputError(
                 f"{path} is {maps.shape[2]}x{maps.shape[1]} (width x height), but its image is {width}x{height}. These "
-                "sizes indicate another crop or orientation. Preprocess the images that the run was trained with, "
-                "which nerfstudio undistorts and crops, or stretch the maps with --regions-resample True"
+                "sizes indicate another crop or orientation. Preprocess the undistorted images, or stretch the maps "
+                "with --regions-resample True"
             )
         return resample_nearest(maps, height, width)
 
@@ -321,7 +324,7 @@ class LangSplat:
 
 
 def is_same_image(map_width: int, map_height: int, width: int, height: int) -> bool:
-    """Return True if a map can show the same image at a different resolution.
+    """Return True if a map can show the same image, at the same or a different resolution.
 
     The sizes must have the same aspect ratio, except for rounding of the smaller size to whole pixels. Sizes
     within 2 % of each other must be equal, because a small difference is probably a crop.

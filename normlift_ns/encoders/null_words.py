@@ -33,13 +33,15 @@ def null_words() -> tuple[str, ...]:
 def null_vectors(
     source: FeatureSource, encoder: Mapping[str, Any], cache: Path | None = None
 ) -> Float[Tensor, "m d"] | None:
-    """Return the vectors of the null vocabulary of a lift, or None if the lift has no null vocabulary.
+    """Return the vectors of the null vocabulary of a lift.
 
-    The vocabulary of precomputed or imported features consists of the texts that were supplied with them.
+    The vocabulary consists of the prompts that were supplied with precomputed features or in a file of text embeddings.
+    For other lifts, it is `null_words`. The result is None if the vocabulary has fewer than five words, or the encoder
+    cannot embed them.
 
     Args:
         encoder: Encoder settings from the manifest.
-        cache: Folder that keeps the vectors of the 200 names, because loading a network for them takes seconds. None:
+        cache: Folder that keeps the vectors of `null_words`, because loading a network for them takes seconds. None:
             compute them.
     """
     kind, file = find_encoder_kind(encoder.get("encoder")), encoder.get("text_vectors")

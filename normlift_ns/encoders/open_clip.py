@@ -51,7 +51,7 @@ def import_open_clip_module(name: str) -> ModuleType:
 
 
 def open_clip_model_names() -> list[str]:
-    """Return the architectures that open_clip can build."""
+    """Return the names of open_clip's architectures."""
     if "open_clip" in sys.modules:  # it also lists architectures added by the user
         return importlib.import_module("open_clip").list_models()
     return sorted(path.stem for path in (_folder() / "model_configs").glob("*.json"))
@@ -183,17 +183,15 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
     if tower is not None and not (timm := importlib.import_module("timm")).is_model(tower):
         raise InputError(
             f"OpenCLIP model {model} (--encoder-model) needs {tower} of timm, but the installed timm "
-            f"{timm.__version__} does not have it, because nerfstudio pins an old version. Use a model without timm, "
+            f"{timm.__version__} does not have it (nerfstudio pins an old version). Use a model without timm, "
             f"such as {DEFAULT_MODEL} or ViT-L-14, or install another timm version at your own risk"
         )
     if os.path.isfile(pretrained) or tags.is_pretrained_cfg(model, pretrained):
         return
     check_not_local(pretrained, 1, "--encoder-pretrained", "not a weight file of an OpenCLIP model", OPEN_CLIP_REMEDY)
-    known = ", ".join(tags.list_pretrained_tags_by_model(model)) or "none"
-    raise InputError(
-        f"unknown weights {pretrained!r} of OpenCLIP model {model}; known tags: {known}. Use one of them, "
-        f"{OPEN_CLIP_REMEDY}"
-    )
+    known = ", ".join(tags.list_pretrained_tags_by_model(model))
+    advice = f"use one of its tags ({known}), " if known else ""
+    raise InputError(f"unknown weights {pretrained!r} of OpenCLIP model {model}; {advice}{OPEN_CLIP_REMEDY}")
 
 
 def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:

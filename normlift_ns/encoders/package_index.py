@@ -135,10 +135,13 @@ def _download_from_indexes(file: PackageFile) -> bytes:
 
 
 def index_urls(settings: dict[str, str]) -> list[str]:
-    """Return the URLs of the configured indexes, starting with the main index.
+    """Return the URLs of the configured indexes, starting with the main index, or [] if pip's no-index is set.
+
+    The main index is PIP_INDEX_URL, UV_DEFAULT_INDEX, UV_INDEX_URL or pip's index-url, whichever is set first. UV_INDEX
+    and UV_EXTRA_INDEX_URL always add indexes, as does pip's extra-index-url.
 
     Args:
-        settings: Result of `pip_settings`. The environment variables of uv apply if PIP_INDEX_URL is not set.
+        settings: Result of `pip_settings`.
 
     >>> index_urls({"index-url": "https://a/simple", "extra-index-url": "https://b/simple"})
     ['https://a/simple', 'https://b/simple']

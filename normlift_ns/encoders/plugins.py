@@ -1,4 +1,8 @@
-"""Adapters for encoders and mask sources of other packages, which check results and add the plugin's name to errors."""
+"""Adapters for encoders and mask sources of other packages.
+
+An adapter checks the results of its plugin. Unexpected exceptions become errors that name the plugin. InputError,
+FileNotFoundError and MemoryError pass unchanged.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +26,12 @@ _Result = TypeVar("_Result")
 class PluginEncoder(Encoder):
     """An adapter for an encoder of another package.
 
-    The wrapped object needs only `identity`, `encode` and `text`. If it also has `patches`, so does the adapter. Error
-    messages include the name of the encoder.
+    The wrapped object needs only `identity`, `encode` and `text`. If it also has `patches`, so does the adapter that
+    `made` returns.
 
     Raises (from all methods):
         InputError: If the encoder fails, or returns a result that violates the `Encoder` protocol.
+        FileNotFoundError, MemoryError: If the encoder raises them.
     """
 
     name: str
@@ -44,14 +49,14 @@ class PluginEncoder(Encoder):
 
     def encode(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
         rows = _call("encoder", self.name, lambda: self.encoder.encode(image, labels))
-        return self._check_rows(rows, int(labels.max()) + 1, "regions")
+        return self._check_rows(rows, int(labels.max()) + 1, "region")
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         check_prompts(prompts)
         rows = _call("encoder", self.name, lambda: self.encoder.text(prompts))
-        return self._check_rows(rows, len(prompts), "texts")
+        return self._check_rows(rows, len(prompts), "prompt")
 
-    def _check_rows(self, rows: object, count: int, units: str) -> Float32[Tensor, "n d"]:
+    def _check_rows(self, rows: object, count: int, unit: str) -> Float32[Tensor, "n d"]:
         """Return the rows as float32 on the CPU; raise InputError unless there are `count` rows of unit length.
 
         Rows of regions and patches may also be zero.
@@ -59,16 +64,16 @@ class PluginEncoder(Encoder):
         if not isinstance(rows, Tensor) or rows.ndim != 2 or len(rows) != count or not rows.is_floating_point():
             received = f"{rows.dtype} {tuple(rows.shape)}" if isinstance(rows, Tensor) else type(rows).__name__
             raise InputError(
-                f"encoder {self.name!r} of another package returned {received} for {count} {units}, expected "
-                f"floats [{count}, D]; fix that package"
+                f"encoder {self.name!r} of another package returned {received}, expected a float tensor [{count}, D] "
+                f"with one row per {unit}; fix that package"
             )
         rows = rows.detach().float().cpu()
         length = torch.linalg.vector_norm(rows, dim=1)
-        length = length if units == "texts" else length.where(length != 0, 1.0)
+        length = length if unit == "prompt" else length.where(length != 0, 1.0)
         if not bool(((length - 1).abs() < UNIT_TOLERANCE).all()):
             raise InputError(
-                f"encoder {self.name!r} of another package returned vectors of {units} whose length is not 1 (such as "
-                f"{float(length[(length - 1).abs().argmax()]):.3g}); normalize them in that package"
+                f"encoder {self.name!r} of another package returned the vector of a {unit} with length "
+                f"{float(length[(length - 1).abs().argmax()]):.3g}, expected 1; normalize the vectors in that package"
             )
         return rows
 
@@ -84,7 +89,7 @@ class DensePluginEncoder(PluginEncoder):
     def patches(self, image: UInt8[Tensor, "h w 3"], rows: int, columns: int) -> Float32[Tensor, "r d"]:
         encoder: Any = self.encoder
         features = _call("encoder", self.name, lambda: encoder.patches(image, rows, columns))
-        return self._check_rows(features, rows * columns, "patches")
+        return self._check_rows(features, rows * columns, "patch")
 
 
 @dataclass(frozen=True)
@@ -92,10 +97,11 @@ class PluginRegions:
     """An adapter for a mask source of another package.
 
     The wrapped object needs only `identity` and `labels(image, name)`. `labels` returns integers, either [H, W] or as
-    in `Regions.labels`. Error messages include the name of the mask source.
+    in `Regions.labels`.
 
     Raises (from all methods):
         InputError: If the mask source fails, or returns a result that violates the `Regions` protocol.
+        FileNotFoundError, MemoryError: If the mask source raises them.
     """
 
     name: str
@@ -138,7 +144,7 @@ class PluginRegions:
             if not torch.equal(ids, torch.arange(len(ids), device=ids.device).to(ids.dtype)):
                 raise InputError(
                     f"mask source {self.name!r} of another package returned ids in {int(level.min())}.."
-                    f"{int(level.max())}, expected ids 0..R-1 without gaps, and -1 for none; fix that package"
+                    f"{int(level.max())}, expected ids from 0 without gaps, and -1 for none; fix that package"
                 )
         return labels.int()
 
@@ -153,7 +159,7 @@ def _make(noun: str, name: str, make: Callable[[], Any], needed: Sequence[str]) 
 
 
 def _call(noun: str, name: str, function: Callable[[], _Result]) -> _Result:
-    """Call a function of another package, and convert its exceptions to errors that name the plugin."""
+    """Call a function of another package, and convert its unexpected exceptions to errors that name the plugin."""
     try:
         return function()
     except (InputError, FileNotFoundError, MemoryError, torch.OutOfMemoryError):

@@ -55,11 +55,11 @@ class EncoderKind:
     """Function that makes the encoder for options and a device such as "cuda". Weights should be loaded at first
     use."""
     rule: RelevancyRule = "lerf"
-    """Default relevancy rule of queries."""
+    """Default relevancy rule of runs without a null vocabulary; other runs use "contrast"."""
     negatives: tuple[str, ...] = CANONICAL_NEGATIVES
-    """Default negative prompts of queries, or () for none."""
+    """Default negative prompts of runs that use `rule`, or () for none."""
     threshold: float | Literal["auto"] = 0.5
-    """Default threshold of queries on the relevancy by `rule`, or "auto" for a threshold from the histogram."""
+    """Default threshold on the relevancy by `rule`, or "auto" for a threshold from the histogram."""
     check: Callable[[SourceOptions], None] = lambda options: None
     """Function that raises InputError or FileNotFoundError for unusable options, without importing torch."""
     texts: Callable[[SourceOptions, str, Path | None, Mapping[str, Any]], LazyTextEncoder] | None = None
@@ -69,8 +69,8 @@ class EncoderKind:
     has_patches: Callable[[SourceOptions], bool] = lambda options: False
     """Function that returns True if the encoder is a `DenseEncoder`, which can embed patches."""
     has_null_words: bool = True
-    """True if the encoder can embed the words of `encoders.null_words`. Queries of new lifts then use the rule
-    "contrast"."""
+    """True if the encoder can embed the words of `encoders.null_words`. If so, new lifts store them as a null
+    vocabulary."""
     known_words: Callable[[str], str] = str
     """Function that returns the words of a prompt that the encoder uses, or "" if the encoder ignores all of them."""
     words: Callable[[], Sequence[str]] = tuple
@@ -78,15 +78,16 @@ class EncoderKind:
     suggested: tuple[float, float] = (0.4, 0.8)
     """Range of suggested thresholds, on a scale from 0 at the median relevancy to 1 at the top relevancy."""
     present_from: tuple[float, float] | None = None
-    """Lower limits on the largest cosine of a prompt, for a weak match and for a match. None: see `query.engine`."""
+    """Lower limits, for a weak match and for a match, on the cosine that one Gaussian in a thousand exceeds. None: the
+    null vocabulary, or the relevancy rule, has the limits."""
     learned: bool = True
     """True if a network processes the images, so that better regions improve its features."""
     pools: bool = False
     """True if the encoder processes each image once and averages inside regions, so that regions take no more time than
     patches."""
     is_here: Callable[[], bool] = lambda: False
-    """Function that returns True if the default weights and the packages of the encoder are on this machine. Otherwise,
-    `--encoder auto` skips the encoder."""
+    """Function that returns True if the default weights and the packages of the encoder are on this machine.
+    `--encoder auto` skips a built-in encoder if it returns False."""
     paths: tuple[str, ...] = ()
     """Names of options that can be the path of a file or folder. Runs store them as absolute paths."""
 
@@ -279,8 +280,8 @@ COLOR = EncoderKind(
     learned=False,
     is_here=lambda: True,
 )
-"""Encoder with mean colors, which are compared with color names. Shades of a color have cosines of 0.7 or more; other
-colors have smaller cosines."""
+"""Encoder with mean colors, which are compared with color names. Most shades of a color have cosines of 0.7 or more;
+most other colors have smaller cosines."""
 
 
 ENCODERS = Registry(
@@ -363,8 +364,8 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
     Args:
         device: Device of the network, such as "cuda"; results are always on the CPU.
     Raises:
-        ValueError: If the encoder, the model, the weights tag or the fill is unknown, or an encoder of another package
-            rejects the options.
+        ValueError: If the encoder, the model or the weights tag is unknown, the prompt template has no placeholder, or
+            an encoder of another package rejects the options.
         FileNotFoundError: If a weight file does not exist.
     """
     from normlift_ns.encoders.plugins import PluginEncoder  # noqa: PLC0415 (needs torch)

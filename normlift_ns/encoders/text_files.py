@@ -128,6 +128,7 @@ class TextEmbeddingFile(LazyTextEncoder):
 
     Raises:
         FileNotFoundError: If the file does not exist.
+        ValueError: If the path is not a file.
     """
 
     file: Path
@@ -235,12 +236,9 @@ def look_up_embeddings(prompts: Sequence[str], vectors: Mapping[str, Any], origi
     for prompt in prompts:
         if prompt not in vectors:
             near = difflib.get_close_matches(prompt, vectors) or list(vectors)[:5]
-            hint = (
-                f"use one of its {len(vectors)} prompts, such as {', '.join(near)}"
-                if len(vectors) > 0
-                else "it is empty, add the vectors of your prompts"
-            )
-            raise InputError(f"prompt {truncate_text(prompt)!r} has no vector in {origin}; {hint}")
+            hint = f"; use a prompt that has one, such as {', '.join(near)}"
+            hint = hint if len(vectors) > 0 else ", which is empty; add the vectors of your prompts"
+            raise InputError(f"prompt {truncate_text(prompt)!r} has no vector in {origin}{hint}")
     return np.stack([unit_rows(vectors[prompt]) for prompt in prompts])
 
 
@@ -279,7 +277,7 @@ def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Pa
 
 @dataclass(frozen=True)
 class CachedTextEncoder(LazyTextEncoder):
-    """A text encoder that caches its embeddings. The key depends on the prompt and on `identity`."""
+    """A text encoder that caches its embeddings. Keys depend on the prompts and on `identity`."""
 
     make_identity: Callable[[], dict[str, Any]]
     """Function that returns all settings that change `text`, as JSON-serializable values. Weight files are identified

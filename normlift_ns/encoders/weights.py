@@ -34,7 +34,7 @@ SAM_WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
 
 @contextmanager
 def third_party_errors(problem: str, remedy: str, error_type: type[Exception] = InputError) -> Iterator[None]:
-    """Convert exceptions of other libraries, which have no common base class, to one error with a remedy.
+    """Convert exceptions of other libraries, except MemoryError, to one error with a remedy.
 
     Args:
         problem: Start of the message.
@@ -83,7 +83,7 @@ def hub_folder(repository: str) -> Path:
 
 
 def check_hub_access() -> None:
-    """Raise OSError if the Hugging Face hub cannot be reached.
+    """Raise OSError if the Hugging Face hub cannot be reached, or HF_HUB_OFFLINE forbids downloads.
 
     The hub's own client would retry for most of a minute.
     """

@@ -37,12 +37,12 @@ from normlift_ns.evidence_collection import (
 )
 from normlift_ns.options import LiftOptions
 from normlift_ns.pipeline import consensus_options, lift_features, min_agreement
-from normlift_ns.rasterization.backend import RasterJob
 from normlift_ns.rasterization.gsplat import check, compiled_rasterizer, project_views
+from normlift_ns.rasterization.rasterize import RasterJob
 
 Baseline = Literal["sfs", "occam", "vala", "drsplat"]
 BASELINES: dict[Baseline, str] = {
-    "sfs": "A^2 weights, idea of SFS",
+    "sfs": "A^2 weights, idea of Splat Feature Solver",
     "occam": "center pixels, idea of Occam's LGS",
     "vala": "gated median, idea of VALA",
     "drsplat": "10 largest weights per ray, idea of Dr.Splat",
@@ -229,7 +229,7 @@ def iter_medians(
     """Yield (Gaussians, unit directions) as in VALA, block by block, with direction 0 without evidence.
 
     Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median of the features
-    of the other views by cosine distance. It is computed by Weiszfeld iterations with weights E / (1 - cosine),
+    of the other views by cosine distance. It is computed by Weiszfeld iterations with weights evidence / (1 - cosine),
     renormalized to length 1.
 
     Args:
@@ -267,7 +267,7 @@ def _weighted_sum(row: Tensor, weight: Tensor, values: Tensor, count: int) -> Te
 
 
 _TIMED_VIEWS = 6
-"""Number of views to time. The time of all views is proportional."""
+"""Largest number of views to time. The time of all views is extrapolated in proportion."""
 _CHANNELS = 32
 _ROUNDS = 3
 
@@ -275,7 +275,7 @@ _ROUNDS = 3
 def dense_sums(
     job: RasterJob, cameras: Sequence[Camera], maps: Iterable[Float[Tensor, "h w d"]], dimension: int
 ) -> Float[Tensor, "n d"]:
-    """Return sum_i A_ij B_i of every Gaussian over the pixels i of all views.
+    """Return sum_i A_ij B_i of every Gaussian j over the pixels i of all views, with the compositing weights A_ij.
 
     The sum is the gradient of gsplat's render with respect to colors. It needs one forward pass per view, and one
     backward pass per 32 channels.
@@ -304,7 +304,7 @@ def dense_sums(
 
 
 def timing_obstacle(lifted: EvaluatedRun, device: str) -> str | None:
-    """Return the reason why SFS's method cannot be timed, or None if it can be."""
+    """Return the reason why the method of Splat Feature Solver cannot be timed, or None if it can be."""
     if not device.startswith("cuda"):
         return f"gsplat needs a GPU, got --device {device}; use --device cuda"
     try:
@@ -315,10 +315,10 @@ def timing_obstacle(lifted: EvaluatedRun, device: str) -> str | None:
 
 
 def time_dense_lift(lifted: EvaluatedRun, device: str) -> dict[str, float]:
-    """Time SFS's method and that of this package, from labels and features to sums per Gaussian.
+    """Time the methods of Splat Feature Solver and of this package, from labels and features to vectors per Gaussian.
 
     Both process the same few views of the lift. Times are medians of three rounds after a warm-up round, in seconds.
-    The time of SFS's method is also extrapolated to all views of the lift.
+    The time of Splat Feature Solver's method is also extrapolated to all views of the lift.
 
     Raises:
         ValueError, FileNotFoundError: If the features of the run are not available (see `lifted_batches`).

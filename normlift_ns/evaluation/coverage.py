@@ -23,9 +23,10 @@ from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.device import choose_device
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.gaussians import Camera, GaussianScene, facing_pose
-from normlift_ns.core.lift import Scalars, reliability
+from normlift_ns.core.lift import Scalars
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.refine import unsupported
+from normlift_ns.core.reliability import reliability
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
@@ -91,7 +92,7 @@ def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], s
     if used is None:
         raise InputError(
             "the run is from an older version and does not record which images had no features; lift the scene again "
-            "with ns-normlift --load-config ..."
+            "with ns-normlift"
         )
     if not set(used) <= set(names):
         raise InputError(
@@ -148,10 +149,10 @@ class WeakRegion:
     Views that hardly show a Gaussian have little influence on it.
     """
     lifted_reliability: float
-    """Mean of the reliability R of the lift, in 0..1. Every view counts in which a Gaussian has weight."""
+    """Mean of the reliability R of the lift, in 0..1. R counts all views in which a Gaussian has weight."""
     norm: float
-    """Mean ||f|| of Gaussians with evidence, in 0..1. It is low if the views disagree; more views of the same
-    kind then do not help."""
+    """Mean ||f|| of the Gaussians with evidence, in 0..1, or 0 if none has evidence. A low value means that the views
+    disagree, so more views of the same kind may not help."""
     views: float
     """Mean number of lifted views that show a Gaussian with at least a tenth of its largest weight in an image."""
     unsupported: float
@@ -189,7 +190,8 @@ def weak_regions(
 ) -> tuple[list[WeakRegion], list[Int64[Tensor, " m"]]]:
     """Return regions of visible Gaussians with R_j(S) below a bound, and the Gaussians of each region.
 
-    Regions are sorted by sum_j s_j (min_reliability - R_j(S)), descending.
+    Regions are sorted by sum_j s_j (min_reliability - R_j(S)), descending. Small regions are left out (see
+    `_MIN_SHARE`), and all after the first `_MAX_REGIONS`.
     """
     surface = evidence.surface
     weak = visible(surface) & (evidence.reliability < min_reliability)
@@ -526,7 +528,10 @@ def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64
 def look_at(
     eye: Float64[Tensor, " 3"], target: Float64[Tensor, " 3"], up: Float64[Tensor, " 3"], like: Camera
 ) -> Camera:
-    """Return a camera with the size and focal length of `like`, and a centered principal point as in ns-render."""
+    """Return a camera that faces a target, with a centered principal point as in ns-render.
+
+    The focal length is the vertical one of `like`. Its sides are rounded down to even numbers of pixels.
+    """
     width, height = (max(2, side - side % 2) for side in (like.width, like.height))  # videos need even sizes
     focal = float(like.K[1, 1])
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
@@ -731,7 +736,7 @@ class Coverage:
 
     @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> list[Path]:
-        """Write a JSON file, <stem>_pose_1.png … and <stem>_camera_path.json, and return the paths.
+        """Write a JSON file and, if there are poses, <stem>_camera_path.json and <stem>_pose_1.png …; return the paths.
 
         `ns-render camera-path` renders the camera path with the run.
 
@@ -823,8 +828,8 @@ def _remarks(
     total, examined = sum(images.left_out.values()), len(images.reasons)
     hidden, single = len(regions) > 0 and len(poses) == 0, len(images.cameras) == 1
     remarks = {
-        f"All surfaces in the images have R of at least {min_reliability:g}, except for parts with less than a "
-        "thousandth of the surface.": len(regions) == 0,
+        f"No part of the surfaces has R below {min_reliability:g}. Parts with less than a thousandth of the surface "
+        "were ignored.": len(regions) == 0,
         "No new pose shows a region well. The regions may be hidden from all free positions.": hidden,
         "All images were lifted, so the study cannot suggest others.": examined == 0,
         f"{total:,} images were not lifted. Only {examined} of them, evenly spaced, were examined.": examined < total,

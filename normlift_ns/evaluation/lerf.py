@@ -128,7 +128,8 @@ def _points(segmentation: Sequence[_Point], width: int, height: int) -> np.ndarr
     points = np.array(segmentation, dtype=float)
     if np.abs(points / (width, height) - 0.5).max() > 1.5:
         raise InputError(
-            f"a segmentation of an image of {width} x {height} pixels has a coordinate of {np.abs(points).max():g}"
+            f"a segmentation or bbox in an image of {width} x {height} pixels has a coordinate of "
+            f"{np.abs(points).max():g}"
         )
     return points
 
@@ -152,8 +153,8 @@ def match_views(files: Sequence[Path], names: Sequence[str]) -> tuple[dict[Path,
     if len(matches) == 0:
         stems = ", ".join(sorted(images)[:3])
         raise InputError(
-            f"none of the {len(files)} label files in {files[0].parent}, such as {files[0].name}, matches an image of "
-            f"the run, such as {stems}, …; give the labels of this scene"
+            f"no label file in {files[0].parent} (such as {files[0].name}) matches an image of the run (such as "
+            f"{stems}); give the labels of this scene"
         )
     for file, candidates in matches.items():
         if len(candidates) > 1:
@@ -197,9 +198,9 @@ def prompt_mask(
 
     Args:
         masking: "background" selects scores that exceed every background word by the margin. "auto" selects scores
-            above SFS's threshold, from their histogram and the number of true instances. "langsplat" and
-            "langsplat_composited" scale the relevancy to 0..1 over the image. They select a pixel if most pixels around
-            it exceed 0.7, which LangSplat writes as 2 x - 1 > 0.4.
+            of at least `histogram_threshold`. "langsplat" and "langsplat_composited" scale the relevancy to 0..1 over
+            the image. They select a pixel if most pixels around it exceed 0.7, which LangSplat writes as
+            2 x - 1 > 0.4.
         margin: Lead over the background words, in cosine.
         instances: Number of true instances.
     """
@@ -231,7 +232,7 @@ def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"],
     """Apply LangSplat's box filter of 30 x 30 pixels.
 
     Returns:
-        The filtered relevancy for the peak, and its average with the relevancy for the threshold.
+        The filtered relevancy, for the peak, and the mean of filtered and original relevancy, for the threshold.
     """
     image = relevancy.float().numpy()
     kernel = np.full((_BOX, _BOX), 1 / _BOX**2, np.float32)
@@ -284,9 +285,9 @@ def summarize_lerf(rows: Sequence[dict[str, Any]], average: AveragingOrder, sett
 
     Args:
         rows: Results of `frame_rows`, each with its scene.
-        average: "frames" averages over the categories of a frame, then over frames (SFS's code). "pairs" averages over
-            all pairs of frame and category (LangSplat's). "categories" averages over the frames of a category, then
-            over categories.
+        average: "frames" averages over the categories of a frame, then over frames (code of Splat Feature Solver).
+            "pairs" averages over all pairs of frame and category (code of LangSplat). "categories" averages over the
+            frames of a category, then over categories.
     """
     by_scene = _grouped(rows, lambda row: row["scene"])
     scenes = [

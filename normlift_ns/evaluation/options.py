@@ -22,8 +22,8 @@ LANGSPLAT_MASKINGS: tuple[Masking, ...] = ("langsplat", "langsplat_composited")
 """Maskings that use LangSplat's relevancy."""
 AveragingOrder = Literal["frames", "pairs", "categories"]
 MASK_MARGIN = 0.02
-"""Default lead in cosine over every background word, from section "Mask thresholding" of the paper. SFS's code uses
-0."""
+"""Default lead in cosine over every background word, from section "Mask thresholding" of the paper. The code of Splat
+Feature Solver uses 0."""
 
 
 MAX_SUGGESTED_POSES = 5
@@ -45,8 +45,7 @@ class ScannetOptions(CheckedOptions):
     """Options of --protocol scannet, which needs one *_vh_clean_2.labels.ply per run in --labels."""
 
     min_opacity: float = 0.1
-    """Smallest opacity of a scored Gaussian, in 0..1. With larger values, fewer Gaussians are scored. With 0, all are
-    scored."""
+    """Smallest opacity of a scored Gaussian, in 0..1. With larger values, fewer Gaussians are scored."""
     without_direction: WithoutDirection = "first"
     """Class of Gaussians without a direction. first assigns wall, as in published scripts. none assigns no class. The
     table also shows the result of the other choice."""
@@ -61,26 +60,27 @@ class LerfOptions(CheckedOptions):
 
     masking: Masking = "background"
     """Conversion of scores to masks. background selects pixels whose score exceeds that of every background word by
-    more than --margin. auto applies SFS's threshold from the histogram. langsplat thresholds LERF's relevancy of unit
-    features per pixel, as in LangSplat. langsplat_composited does so for composited scores, without normalizing
-    features."""
+    more than --margin. auto applies the threshold of Splat Feature Solver, from the histogram of an image's scores and
+    the true number of objects. langsplat thresholds LERF's relevancy of unit features per pixel, as in LangSplat.
+    langsplat_composited does so for composited scores, without normalizing features."""
     margin: float = MASK_MARGIN
-    """Lead over the best background word for --masking background, in cosine. Larger values give smaller masks. SFS's
-    code uses 0."""
+    """Lead over the best background word for --masking background, in cosine. Larger values give smaller masks. The
+    code of Splat Feature Solver uses 0."""
     average: AveragingOrder = "frames"
     """Averaging within a scene. frames averages the categories of each frame, then the frames. pairs averages all
     pairs of frame and category. categories averages the frames of each category, then the categories."""
     clean: bool = False
-    """Open and close each mask, keep its largest component and fill its holes, as in SFS's code. The image border
-    becomes empty. The paper does not specify this step."""
+    """Open and close each mask, keep its largest component and fill its holes, as in the code of Splat Feature Solver.
+    Pixels at the image border are lost. The paper does not specify this step."""
     scale: Literal["unit", "norm"] = "unit"
-    """Scores to composite. unit composites cosines. norm composites cosines times ||f||, as in SFS, which does not
-    normalize features."""
+    """Scores to composite. unit composites cosines. norm composites cosines times ||f||, as in Splat Feature Solver,
+    which does not normalize features."""
 
 
 @dataclass(frozen=True)
 class MaskOptions(CheckedOptions):
-    """Options of --protocol masks, which needs a folder of PNG or NPY instance masks, named like the images."""
+    """Options of --protocol masks, which needs a folder of PNG or NPY instance masks in --labels, named like the
+    images."""
 
     names: Path | None = None
     """JSON file with the name of every mask value. None: labels.json next to the mask folder."""
@@ -131,7 +131,7 @@ class Evaluation:
     """Metrics of one protocol for one or several runs."""
 
     results: Mapping[str, float]
-    """Metrics by name, for `results` in the file of ns-eval. Shares are in 0..1."""
+    """Metrics by name, as in the `results` of a file of ns-eval. Shares are in 0..1."""
     rows: Sequence[Mapping[str, Any]]
     """Metrics per class and per scene or frame, as JSON types."""
     settings: Mapping[str, Any]

@@ -108,7 +108,7 @@ def gaussian_truth(
     A Gaussian below either minimum has class -1.
 
     Args:
-        purity: Smallest share of the class in the weight of the Gaussian, which includes ignored pixels.
+        purity: Smallest share of the class in the weight of the Gaussian. The weight includes that of ignored pixels.
         min_weight: Smallest weight over all views, in pixels.
     """
     columns = torch.arange(evidence.num_regions) % classes
@@ -224,7 +224,7 @@ def rasterizer(scene: Scene, settings: RasterSettings | None, gaussians: Gaussia
 
 
 def scene_names(labels: Sequence[Path]) -> list[str]:
-    """Return a scene name for each label file or folder, which is its name, or its path if names are not unique.
+    """Return a scene name for each label file or folder: its name before "_vh_clean", or its path if not unique.
 
     >>> scene_names([Path("label/ramen"), Path("a/scene0000_00_vh_clean_2.labels.ply")])
     ['ramen', 'scene0000_00']

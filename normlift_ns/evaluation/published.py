@@ -199,7 +199,7 @@ def _of_signals(rows: Sequence[Mapping[str, Any]]) -> Numbers:
 
 
 def _of_timing(rows: Sequence[Mapping[str, Any]]) -> Numbers:
-    """Return the seconds of the lift, including the evidence, and of the neighbors and the vote together."""
+    """Return two sums of seconds per scene: of evidence, consensus and lift, and of neighbors and vote."""
     parts = {"lift_s": ("evidence_s", "consensus_s", "lift_s"), "post_lift_s": ("neighbors_s", "vote_s")}
     return {
         (row["scene"], metric): sum(row.get(name, 0.0) for name in names)

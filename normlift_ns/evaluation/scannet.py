@@ -27,7 +27,7 @@ NYU40 = {
     10: "bookshelf", 11: "picture", 12: "counter", 14: "desk", 16: "curtain", 24: "refrigerator", 28: "showercurtain",
     33: "toilet", 34: "sink", 36: "bathtub",
 }  # fmt: skip
-"""Prompts by NYU40 id, which are class names as spelled in OpenGaussian's script."""
+"""Prompts by NYU40 id: the class names as spelled in OpenGaussian's script."""
 PAPER_SPELLING = {28: "shower curtain"}
 """Class names by NYU40 id that the paper spells differently."""
 _LAST_ID = 40
@@ -89,8 +89,8 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
     unknown = (labels > _LAST_ID) | (labels < -1)
     if unknown.any():
         warnings.warn(
-            f"{path}: {int(unknown.sum()):,} of {len(labels):,} labels are not valid NYU40 ids, such as "
-            f"{labels[unknown][0]}; they are treated as unlabeled",
+            f"{path} has labels that are not NYU40 ids, such as {labels[unknown][0]} ({int(unknown.sum()):,} of "
+            f"{len(labels):,} labels); they are treated as unlabeled",
             stacklevel=2,
         )
     return torch.from_numpy(np.where(unknown, 0, labels))

@@ -18,14 +18,14 @@ _EPSILON = 1e-12
 
 
 def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
-    """Return the threshold of SFS's attention maps as a float32 number. It selects scores >= threshold.
+    """Return Splat Feature Solver's threshold of a score map as a float32 number. It selects scores >= threshold.
 
     The histogram has 40 bins from the smallest to the largest score. A peak is a bin with at least 600 pixels and no
-    larger neighbor, so every bin of a plateau is a peak. The rule uses the k-th peak from the right for k true
+    larger neighbor, so every bin of a flat top is a peak. The rule uses the k-th peak from the right for k true
     instances, or the rightmost peak if there are fewer.
 
     The valley is the nearest bin to the left that is lower than the peak and has no lower neighbor. The first bin
-    is excluded. If there is no such bin, the valley is the rightmost lower bin on the right of the peak. The threshold
+    is excluded. Without such a bin, the valley is the rightmost lower bin on the right of the peak. The threshold
     is the center of the valley.
 
     Without a peak or a valley, the threshold is the mean of Otsu's threshold on the 40 bins and the 75th percentile. If

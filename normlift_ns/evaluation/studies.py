@@ -15,11 +15,12 @@ from torch import Tensor
 
 from normlift_ns.core.arguments import check_arguments
 from normlift_ns.core.field import SemanticField
-from normlift_ns.core.lift import Lifted, Scalars, reliability
+from normlift_ns.core.lift import Lifted, Scalars
 from normlift_ns.core.lowrank import StoredDirections
 from normlift_ns.core.metrics import NO_CLASS, bin_means, classify, kendall_test, lowest_jaccard, spearman_test
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
 from normlift_ns.core.refine import decay_width, refine, voting_weights
+from normlift_ns.core.reliability import reliability
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.baselines import BASELINES, baseline_field, time_dense_lift, timing_obstacle, with_consensus
 from normlift_ns.evaluation.options import Evaluation, ScannetOptions, mean
@@ -47,8 +48,8 @@ def refine_variant(
     """Return the directions after one variant of the refinement, as unit rows or 0.
 
     Args:
-        variant: "none" returns the directions of the lift. "linear" averages the directions of N+ with the weights
-            R_k d_ik and normalizes the result. The others vote with `variant_config` and `variant_reliability`.
+        variant: "none" returns the directions of the lift. "linear" returns `linear_average`. The others vote with
+            `variant_config` and `variant_reliability`.
         beta: Prior strength of the shrinkage of R, as in `lift`.
     Raises:
         ValueError: If the variant is unknown.
@@ -127,7 +128,10 @@ def variant_reliability(variant: Variant, scalars: Scalars, beta: float = 1.0) -
 def linear_average(
     directions: Float[Tensor, "n d"], reliability: Float[Tensor, " n"], neighbors: Neighbors, config: RefineConfig
 ) -> Float[Tensor, "n d"]:
-    """Return normalize(sum_{k in N+} R_k d_ik u_k) for every Gaussian i, or u_i if the sum is 0."""
+    """Return normalize(sum_{k in N+} R_k d_ik u_k) for every Gaussian i, or its direction u_i if the sum is 0.
+
+    N+ contains i and its neighbors, R_k is the reliability, and d_ik decreases with the distance.
+    """
     out, width = torch.empty_like(directions), decay_width(neighbors.spacing, config)
     for i in torch.arange(len(directions), device=directions.device).split(2**14):
         group = torch.cat([i[:, None], neighbors.index[i]], dim=1).clamp(min=0)
@@ -201,9 +205,9 @@ def variant_votes(variants: Mapping[str, Variant], owns: Sequence[Vote]) -> Iter
 
 
 def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
-    """Yield the votes of `SWEEPS` around the values of each run, one vote per run.
+    """Yield the votes with each value of `SWEEPS`, its default and the values of the runs, one vote per run.
 
-    The default and the values of the runs are included, and labels mark them.
+    Other parameters keep the values of the run. Labels mark the default and the values of the runs.
     """
     for parameter, values in SWEEPS.items():
         default = default_value(parameter, owns[0].config.vote)
@@ -284,7 +288,7 @@ class SceneSignals:
     opacity: Float[Tensor, " n"]
     """Opacity in 0..1."""
     truth: Int[Tensor, " n"] | None = None
-    """Class of every Gaussian, or `NO_CLASS` for Gaussians to ignore. None if there is no ground truth."""
+    """Class of every Gaussian, or `NO_CLASS` for Gaussians to ignore. None without ground truth."""
     predictions: Mapping[str, Int[Tensor, " n"]] = field(default_factory=dict)
     """Predicted class of every Gaussian, under the keys "unrefined" and, if there was a vote, "refined"."""
 
@@ -294,14 +298,15 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
 
     The groups are `all`, `zero` (R = 0) and `seen` (R > 0), as in the paper's table of zero-evidence Gaussians. Each
     has its `.share` of all Gaussians, the mean `.opacity`, the share of `.faint` Gaussians and the mean number of
-    `.views`. With ground truth, it also has `.accuracy_unrefined` and `.accuracy_refined`.
+    `.views`. With ground truth, it also has `.accuracy_unrefined` and, after a vote, `.accuracy_refined`.
 
     Opacity is compared with R for Gaussians with R > 0. `opacity.spearman` and `opacity.kendall` are correlations, with
-    p-values `…_p`. `opacity.jaccard` compares the lowest fifths. `opacity.quintile1` … are mean opacities by ascending
-    R.
+    p-values `…_p`. `opacity.jaccard` is the Jaccard index of the fifth with the lowest R and the fifth with the lowest
+    opacity. `opacity.quintile1` … are mean opacities by ascending R.
 
-    `reliability.bin1` … `bin10` and `norm.bin1` … are the accuracies of unrefined predictions in ten bins of equal
-    count. `….spearman_bins` is their rank correlation with the bin number. `histogram.0.00` … are shares by R.
+    With ground truth, `reliability.bin1` … `bin10` and `norm.bin1` … are the accuracies of unrefined predictions in ten
+    bins of equal count, by R and by ||f||. `….spearman_bins` is their rank correlation with the bin number.
+    `histogram.0.00` … are shares by R.
 
     The p-values assume that Gaussians are independent, but neighbors are not independent.
     """
@@ -552,10 +557,10 @@ def study_timing(
 ) -> list[Row]:
     """Return the seconds of every stage and the peak memory of every lift from the manifests, and means over the lifts.
 
-    On a GPU, also time SFS's method and that of this package on some views of each run.
+    On a GPU, also time the method of Splat Feature Solver and that of this package on some views of each run.
 
     Args:
-        tell: Callback with the reason if SFS's method is skipped.
+        tell: Callback with the reason if the method of Splat Feature Solver is skipped.
     """
     rows = []
     for lifted in runs:
@@ -567,7 +572,8 @@ def study_timing(
             except (ValueError, FileNotFoundError) as error:  # features are not available
                 reason = str(error)
         if reason is not None:
-            tell(f"The timing of {lifted.scene.name} skips SFS's method (512 channels through gsplat): {reason}")
+            method = "the method of Splat Feature Solver (all channels of feature maps through gsplat)"
+            tell(f"The timing of {lifted.scene.name} skips {method}: {reason}")
         rows.append(row)
     keys = list(dict.fromkeys(key for row in rows for key in row if key != "scene"))
     table: list[Row] = [{"scene": row["scene"], **{key: row.get(key, math.nan) for key in keys}} for row in rows]

@@ -200,7 +200,7 @@ def complete_journal(temporary: Path) -> bool:
     """Complete or undo the steps in the journal of a temporary folder.
 
     Returns:
-        True if all steps are done or there is no journal; False if this user did not write the journal.
+        True if all steps are done or no journal exists; False if this user did not write the journal.
     """
     journal = temporary / f"steps{JOURNAL_SUFFIX}"
     if not os.path.lexists(journal):

@@ -242,7 +242,7 @@ def find_field_folder(semantics: Path) -> Path:
     config to models. It is therefore read from the call stack.
 
     Args:
-        semantics: Folder in the config, which is returned if there is no folder next to config.yml.
+        semantics: Folder in the config, which is returned if config.yml has no folder next to it.
     """
     frame = inspect.currentframe()
     while frame is not None:

@@ -15,7 +15,6 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from normlift_ns.api import query_to_store
 from normlift_ns.data.checkpoint import numpy_scalar_globals
 from normlift_ns.data.nerfstudio.config import check_components, check_lift_options, dataset_in_config
 from normlift_ns.data.nerfstudio.dataset_views import DatasetViews
@@ -29,7 +28,7 @@ from normlift_ns.io.run_dir import FIELD_FOLDER, add_digest_comment, cache_folde
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel
 from normlift_ns.nerfstudio_plugin.panel import rerender_clients
 from normlift_ns.options import LiftOptions, SourceOptions
-from normlift_ns.pipeline import lift_scene
+from normlift_ns.pipeline import lift_scene, query_to_store
 from normlift_ns.query.question import save_query
 from normlift_ns.query.text_encoder import encoder_settings
 from normlift_ns.segmentation.registry import describe_choice

@@ -8,29 +8,31 @@ from __future__ import annotations
 
 import os
 import re
-from bisect import bisect_left
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from normlift_ns.core.arguments import check_arguments
-from normlift_ns.core.relevancy import (
-    PROMPT_BLOCK,
-    RELEVANCY_RULES,
-    gaussian_relevancy,
-    top_values,
-)
+from normlift_ns.core.relevancy import PROMPT_BLOCK, RELEVANCY_RULES, gaussian_relevancy, top_values
 from normlift_ns.encoders.registry import find_encoder_kind
 from normlift_ns.options import RelevancyRule
-from normlift_ns.query.histograms import Histogram, relevancy_histogram, suggest_threshold, suggested_range
 from normlift_ns.query.question import Query, as_numpy
 from normlift_ns.query.text_encoder import HasManifest, encoder_name
+from normlift_ns.query.threshold import (
+    Histogram,
+    Verdict,
+    compares_cosines,
+    judge,
+    relevancy_histogram,
+    suggest_threshold,
+    suggested_range,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,9 +40,6 @@ if TYPE_CHECKING:
     from normlift_ns.analysis.objects import SceneObject
     from normlift_ns.core.field import SemanticField
 
-Verdict = Literal["found", "weak match", "probably not here"]
-"""Presence of a prompt in a scene. found: the prompt matches better than almost all unrelated words.
-weak match: it matches better than most of them. probably not here: it does not."""
 _CENTRAL = (0.05, 0.95)
 """Quantiles of the selected centers that bound their extent."""
 _SUMMARIZED = ("reliability", "weight")
@@ -418,58 +417,3 @@ def apply_threshold(answer: Answer, question: Query) -> Answer:
             if verdict == "probably not here":
                 selected[:, index] = False
     return replace(answer, question=question, selected=selected)
-
-
-# Presence of prompts in a scene.
-#
-# The rank of a prompt is the fraction of the null vocabulary whose best cosine is lower than that of the prompt. The
-# limits on the rank fix the rate of false positives: with every encoder, one unrelated word in ten is "found". The
-# color encoder has limits on the cosine instead. Without a null vocabulary of at least 100 words, the verdict depends
-# on the relevancy, which compares the prompt with the negatives. docs/honest_answers.md has the counts.
-
-
-_FOUND_RANK, _WEAK_RANK = 0.9, 0.7
-"""Minimum ranks of a prompt (see `null_rank`) for the verdicts "found" and "weak match"."""
-_FEWEST_NULL_WORDS = 100
-"""Minimum number of unrelated words (null words) for a meaningful `null_rank`."""
-
-
-def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
-    """Return the rank of a prompt, in 0..1; None if the field has too few null words.
-
-    The rank is the fraction of unrelated words (null words) whose top cosine is below `top_cosine`.
-    """
-    tops = (manifest.get("null_words") or {}).get("tops", ())
-    return bisect_left(tops, top_cosine) / len(tops) if len(tops) >= _FEWEST_NULL_WORDS else None
-
-
-def compares_cosines(manifest: Mapping[str, Any], encoder: str | None) -> bool:
-    """Return whether `judge` uses cosines (with limits of the encoder or null words) instead of relevancies."""
-    kind = find_encoder_kind(encoder)
-    return (kind is not None and kind.present_from is not None) or null_rank(manifest, 0.0) is not None
-
-
-def judge(
-    manifest: Mapping[str, Any], encoder: str | None, rule: RelevancyRule, *, top_cosine: float, top: float
-) -> Verdict | None:
-    """Return the verdict on a prompt; None if there are no null words, limits or negatives to compare with.
-
-    Args:
-        manifest: Manifest of the field.
-        encoder: Name of the encoder of the field.
-        rule: Relevancy rule of the query.
-        top_cosine: Cosine that one Gaussian in a thousand exceeds.
-        top: Relevancy that one Gaussian in a thousand exceeds.
-    """
-    kind, rank = find_encoder_kind(encoder), null_rank(manifest, top_cosine)
-    if kind is not None and kind.present_from is not None:
-        return _by_limits(top_cosine, kind.present_from)
-    if rank is not None:
-        return _by_limits(rank, (_WEAK_RANK, _FOUND_RANK))
-    settings = RELEVANCY_RULES[rule]
-    return None if settings.presence_limit is None else _by_limits(top, (settings.threshold, settings.presence_limit))
-
-
-def _by_limits(value: float, limits: tuple[float, float]) -> Verdict:
-    weak, found = limits
-    return "found" if value >= found else "weak match" if value >= weak else "probably not here"

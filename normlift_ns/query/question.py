@@ -244,7 +244,7 @@ def save_query(folder: Path, question: Query) -> Path:
 
 
 def load_query(folder: Path) -> Query | None:
-    """Load the query stored in the folder of a field; return None if there is no stored query.
+    """Load the query stored in the folder of a field; return None if it has no stored query.
 
     Raises:
         ValueError: The file is damaged, or does not contain a query.

@@ -1,7 +1,7 @@
 """Summaries of many prompts at once, for answers on a GPU. They equal those of `Finding.to_json` up to rounding.
 
 The sums, sorts and counts over Gaussians are operations on blocks of prompts. Only a few numbers per prompt leave the
-GPU, from which `query.histograms` computes the rest.
+GPU, from which `query.threshold` computes the rest.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from normlift_ns.query.histograms import Histogram, make_histograms, picked_ranks
+from normlift_ns.query.threshold import Histogram, make_histograms, picked_ranks
 
 _CENTRAL = (0.05, 0.95)
 """Quantiles of the selected centers that bound their extent."""

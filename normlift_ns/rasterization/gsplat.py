@@ -22,8 +22,8 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.errors import InputError
 from normlift_ns.options import GSPLAT_VERSIONS
-from normlift_ns.rasterization.backend import RasterBatch, RasterJob, check_gpu
 from normlift_ns.rasterization.projection import camera_depths, prepare_gaussians, project
+from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob, check_gpu
 from normlift_ns.rasterization.settings import RasterSettings
 
 _CHANNELS = 32

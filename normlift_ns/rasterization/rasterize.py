@@ -1,15 +1,17 @@
-"""Rasterization of evidence and images with a suitable backend, and compositing weights along a ray."""
+"""Rasterization of evidence and images: backends and the choice of one, and compositing weights along a ray."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from importlib import import_module
 from itertools import groupby, islice, zip_longest
-from typing import Any, NamedTuple, TypedDict, cast, get_args
+from typing import Any, NamedTuple, Protocol, TypedDict, cast, get_args
 
 import torch
-from jaxtyping import Float, Float64, Int, Int64, UInt8
+from jaxtyping import Float, Float64, Int, Int32, Int64, UInt8
 from torch import Tensor
 from typing_extensions import Unpack
 
@@ -21,50 +23,109 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.errors import InputError
 from normlift_ns.options import BackendName, RasterizeMode, short_repr
-from normlift_ns.rasterization.backend import Backend, RasterBatch, RasterJob, TileBackend
+from normlift_ns.rasterization import projection
 from normlift_ns.rasterization.settings import RasterSettings
 
-
-def view_colors(
-    means: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n k 3"], camera: Camera, degree: int | None
-) -> Float[Tensor, "n 3"]:
-    """Return RGB >= 0 of every Gaussian, as splatfacto and gsplat.rasterization compute it.
-
-    Args:
-        means: Centers of the Gaussians.
-        coefficients: features_dc and features_rest of a checkpoint, [N, 1 + rest, 3].
-        camera: Camera of the image.
-        degree: Degree of the spherical harmonics with (degree + 1) ** 2 <= K, or None if the coefficients are logits.
-    """
-    if degree is None:
-        return torch.sigmoid(coefficients[:, 0])
-    from gsplat.cuda._torch_impl import _spherical_harmonics  # noqa: PLC0415 (slow import)
-
-    pose = camera.world_to_camera.to(means)
-    center = -pose[:3, :3].T @ pose[:3, 3]
-    return (_spherical_harmonics(degree, means - center, coefficients) + 0.5).clamp(min=0)
+# Backends: their interface, the backend in plain torch, and the choice of a backend.
 
 
-def rotate_harmonics(coefficients: Float[Tensor, "n k 3"], rotation: Float64[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
-    """Return the spherical harmonics of colors that rotate with their Gaussians.
+@dataclass(frozen=True)
+class RasterJob:
+    """Scene and options of one call, shared by all its views."""
 
-    Harmonics in many directions before and after the rotation determine its matrix by least squares.
+    scene: GaussianScene
+    antialiased: bool
+    settings: RasterSettings
+    dtype: torch.dtype
+    """Precision of the computation."""
+    weight_power: int = 1
+    """Exponent p of the weights. The evidence is the sum of A_ij ** p."""
 
-    Args:
-        coefficients: Coefficients of the spherical harmonics without the constant term, in gsplat's order.
-        rotation: Rotation of the Gaussians.
-    """
-    from gsplat.cuda._torch_impl import _eval_sh_bases_fast  # noqa: PLC0415 (slow import)
+    @cached_property
+    def prepared(self) -> projection.AnyPrepared:
+        """The drawable Gaussians, prepared for any camera."""
+        prepare = projection.prepare_gaussians_2d if self.is_2d else projection.prepare_gaussians
+        return prepare(self.scene, self.dtype)
 
-    size = coefficients.shape[1] + 1
-    directions = torch.randn(8 * size, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    directions = directions / directions.norm(dim=1, keepdim=True)
-    before, after = (_eval_sh_bases_fast(size, points)[:, 1:] for points in (directions @ rotation, directions))
-    matrix = torch.linalg.lstsq(after, before).solution
-    return (matrix.to(coefficients) @ coefficients) if size > 1 else coefficients
+    @property
+    def is_2d(self) -> bool:
+        """True for a scene of 2D Gaussian Splatting."""
+        return self.scene.primitive == "2dgs"
+
+    def project(self, camera: Camera) -> projection.AnyProjected:
+        """Project the Gaussians into a camera."""
+        if isinstance(self.prepared, projection.PreparedGaussians2D):
+            return projection.project_2d(self.prepared, camera, self.settings)
+        return projection.project(self.prepared, camera, self.settings, self.antialiased)
 
 
-# Choice of a backend.
+def check_gpu(backend: str, job: RasterJob) -> None:
+    """Raise ValueError if a job is not in float32 on a GPU."""
+    means = job.scene.means
+    if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
+        other = str(job.dtype if means.dtype == torch.float32 else means.dtype).removeprefix("torch.")
+        raise InputError(
+            f'backend "{backend}" needs float32 on a GPU, got {other} on {means.device.type}; use backend="auto" to '
+            "choose a backend that supports these"
+        )
+
+
+class RasterBatch(NamedTuple):
+    """Views of the same size that are rasterized together."""
+
+    cameras: Sequence[Camera]
+    labels: Sequence[Int32[Tensor, "h w"]]
+    num_regions: Sequence[int]
+
+
+class Backend(Protocol):
+    """Interface of a backend, implemented by `TileBackend` and the modules `numba`, `gsplat` and `triton`."""
+
+    def check(self, job: RasterJob) -> None:
+        """Raise ValueError if the backend does not support the job. The message suggests an alternative."""
+        ...
+
+    def in_flight(self, job: RasterJob, camera: Camera) -> int:
+        """Return the number of views of this camera's size to pass to one call of `views_evidence`."""
+        ...
+
+    def views_evidence(self, job: RasterJob, batch: RasterBatch) -> Entries:
+        """Return the sums of A_ij ** weight_power by (Gaussian, region)."""
+        ...
+
+    def composite(
+        self, job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
+    ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+        """Return sum_j A_ij values_j and sum_j A_ij of every pixel."""
+        ...
+
+
+class TileBackend:
+    """Backend in plain torch for any device and precision, which processes one view at a time."""
+
+    def check(self, job: RasterJob) -> None:
+        """Accept every job on any device."""
+
+    def in_flight(self, job: RasterJob, camera: Camera) -> int:
+        """Return 1, because views are processed one at a time."""
+        return 1
+
+    def views_evidence(self, job: RasterJob, batch: RasterBatch) -> Entries:  # noqa: D102 (as in the protocol)
+        (camera,), (labels,), (count,) = batch
+        projected, tiles = _with_tiles(job, camera)
+        return projection.view_evidence(projected, tiles, labels, count, job.weight_power, job.settings)
+
+    def composite(  # noqa: D102 (as in the protocol)
+        self, job: RasterJob, camera: Camera, values: Float[Tensor, "n c"]
+    ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+        projected, tiles = _with_tiles(job, camera)
+        visible_values = values[projected.gaussian].to(projected.opacities.dtype)
+        return projection.composite(projected, tiles, visible_values, camera.width, camera.height, job.settings)
+
+
+def _with_tiles(job: RasterJob, camera: Camera) -> tuple[projection.AnyProjected, projection.TileLists]:
+    projected = job.project(camera)
+    return projected, projection.assign_tiles(projected, camera.width, camera.height, job.settings.tile_size)
 
 
 def choose_backend(name: str, job: RasterJob) -> tuple[str, Backend]:
@@ -490,6 +551,48 @@ def _check_pixels(pixels: Tensor, camera: Camera) -> Int64[Tensor, "p 2"]:
     return pixels.long()
 
 
+# Colors of Gaussians.
+
+
+def view_colors(
+    means: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n k 3"], camera: Camera, degree: int | None
+) -> Float[Tensor, "n 3"]:
+    """Return RGB >= 0 of every Gaussian, as splatfacto and gsplat.rasterization compute it.
+
+    Args:
+        means: Centers of the Gaussians.
+        coefficients: features_dc and features_rest of a checkpoint, [N, 1 + rest, 3].
+        camera: Camera of the image.
+        degree: Degree of the spherical harmonics with (degree + 1) ** 2 <= K, or None if the coefficients are logits.
+    """
+    if degree is None:
+        return torch.sigmoid(coefficients[:, 0])
+    from gsplat.cuda._torch_impl import _spherical_harmonics  # noqa: PLC0415 (slow import)
+
+    pose = camera.world_to_camera.to(means)
+    center = -pose[:3, :3].T @ pose[:3, 3]
+    return (_spherical_harmonics(degree, means - center, coefficients) + 0.5).clamp(min=0)
+
+
+def rotate_harmonics(coefficients: Float[Tensor, "n k 3"], rotation: Float64[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
+    """Return the spherical harmonics of colors that rotate with their Gaussians.
+
+    Harmonics in many directions before and after the rotation determine its matrix by least squares.
+
+    Args:
+        coefficients: Coefficients of the spherical harmonics without the constant term, in gsplat's order.
+        rotation: Rotation of the Gaussians.
+    """
+    from gsplat.cuda._torch_impl import _eval_sh_bases_fast  # noqa: PLC0415 (slow import)
+
+    size = coefficients.shape[1] + 1
+    directions = torch.randn(8 * size, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    before, after = (_eval_sh_bases_fast(size, points)[:, 1:] for points in (directions @ rotation, directions))
+    matrix = torch.linalg.lstsq(after, before).solution
+    return (matrix.to(coefficients) @ coefficients) if size > 1 else coefficients
+
+
 # Compositing weights along a ray, computed in 3D without an image.
 
 
@@ -506,7 +609,8 @@ def ray_weights(
     """Return the weight alpha_j prod_{k<j} (1 - alpha_k) of every Gaussian along a ray, or 0 if the ray misses it.
 
     alpha_j is the opacity times the largest value of the Gaussian along the ray. Gaussians are sorted by the distance
-    of this maximum from the origin. There is no blur, so the result does not depend on the resolution of an image.
+    of this maximum from the origin. The Gaussians are not blurred, so the result does not depend on the
+    resolution of an image.
 
     Args:
         scene: N Gaussians.

@@ -19,7 +19,7 @@ from normlift_ns.kernels.compositing import AlphaLimits, CellGrid, CellLists, bu
 from normlift_ns.kernels.projection import SPLAT, ProjectedSplats, ProjectionSettings, project_gaussians
 from normlift_ns.kernels.projection_2dgs import SPLAT_2D, Settings2D, project_gaussians_2d
 from normlift_ns.options import RasterizeMode
-from normlift_ns.rasterization.backend import RasterBatch, RasterJob, check_gpu
+from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob, check_gpu
 from normlift_ns.rasterization.settings import RasterSettings
 
 CELL, SMALL_CELL = (16, 16), (16, 8)

@@ -28,7 +28,8 @@ from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_file, atomic_files, numbered_paths, safe_file_name
 from normlift_ns.options import WEAK_RELIABILITY
-from normlift_ns.query.engine import Answer, Finding, Verdict
+from normlift_ns.query.engine import Answer, Finding
+from normlift_ns.query.threshold import Verdict
 from normlift_ns.rasterization.rasterize import render, render_image, render_with_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.rendering import colors
@@ -44,7 +45,7 @@ class Display:
     """Scalars to render in addition to the colors, and their color scales.
 
     The class is immutable because the viewer renders in other threads. Q is the number of prompts; it is
-    0 if there is no answer.
+    0 without an answer.
     """
 
     values: Float[Tensor, "n q_plus_5"]
@@ -556,7 +557,7 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
         matches = matches or [i for i, image in enumerate(images) if PurePosixPath(image).stem == name]
         if len(matches) == 0:
             raise InputError(
-                f"--render-views: there is no training image {name!r}. Expected one of {len(images)} names from "
+                f"--render-views: the scene has no training image {name!r}. Expected one of {len(images)} names from "
                 f"{unique[0]!r} to {unique[-1]!r}, without suffix. Images held out for evaluation are not available."
             )
         if len(matches) > 1:

@@ -59,6 +59,8 @@ REQUEST_TIMEOUT = 120.0
 _HEADER_TIMEOUT, _BODY_TIMEOUT, _KEEP_ALIVE = 10.0, 20.0, 20
 _MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
 _TRIM_INTERVAL = 2.0
+_IDLE_SECONDS = 1.0
+"""Seconds without a request after which the server computes data in advance."""
 _QUICK_THREADS = 4
 _THREADS = max(2, torch.get_num_threads() // 2)
 """Number of threads for queries, and of those for slower work such as explanations. Each thread uses several cores."""
@@ -239,6 +241,7 @@ class WarmServer:
         self._opening = CapacityLimiter(MAX_PAGES)
         self._downloads: OrderedDict[str, tuple[str, bytes]] = OrderedDict()
         self._pages, self._next_trim = 0, 0.0
+        self._num_working, self._last_work = 0, 0.0
         self._server: uvicorn.Server | None = None
 
     def app(self, extra_routes: Sequence[Any] = (), lifespan: Any = None) -> ASGIApp:
@@ -273,7 +276,7 @@ class WarmServer:
             HTTPException: No run has this id (status 404).
         """
         if name not in self.runs.ids:
-            raise HTTPException(404, f"There is no run {name[:80]!r}. Choose one of: {', '.join(self.runs.ids)}.")
+            raise HTTPException(404, f"The server has no run {name[:80]!r}. Choose one of: {', '.join(self.runs.ids)}.")
         return await anyio.to_thread.run_sync(self.runs.get, name, limiter=self._opening, abandon_on_cancel=True)
 
     async def in_thread(self, work: Callable[[], T], *, slow: bool = True) -> T:
@@ -283,11 +286,23 @@ class WarmServer:
             slow: True to use the threads for slow work, False to use those for queries.
         """
         limiter = self.limits.slow if slow else self.limits.asking
-        result = await anyio.to_thread.run_sync(work, limiter=limiter, abandon_on_cancel=True)
+        self._num_working += 1
+        try:
+            result = await anyio.to_thread.run_sync(work, limiter=limiter, abandon_on_cancel=True)
+        finally:
+            self._num_working, self._last_work = self._num_working - 1, time.monotonic()
         if time.monotonic() > self._next_trim:
             self._next_trim = time.monotonic() + _TRIM_INTERVAL
             await anyio.to_thread.run_sync(_trim_memory, limiter=self.limits.slow, abandon_on_cancel=True)
         return result
+
+    def warm_up(self) -> None:
+        """Compute in advance the data that the first pages need, mostly while no request is in progress."""
+        self.runs.warm_up(self._wait_until_idle)
+
+    def _wait_until_idle(self) -> None:
+        while self._num_working > 0 or time.monotonic() < self._last_work + _IDLE_SECONDS:
+            time.sleep(_IDLE_SECONDS / 10)
 
     def may_write(self, access: str) -> bool:
         """Return True if a request with the token `access` may write into a run."""

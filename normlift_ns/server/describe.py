@@ -16,7 +16,6 @@ from normlift_ns.analysis.explain import ViewVote
 from normlift_ns.errors import InputError
 from normlift_ns.query.engine import Finding
 from normlift_ns.server import protocol
-from normlift_ns.server.coloring import legend, prompt_display_colors
 from normlift_ns.server.runs import ServedRun, to_jpeg, without_paths
 from normlift_ns.session import actions
 from normlift_ns.session.actions import diagnose_prompts, threshold_suggestion
@@ -28,6 +27,8 @@ MAX_OBJECTS = 24
 _MAX_HISTOGRAMS = 8
 _MAX_IMAGES = 3
 """Maximum number of images with the largest weight, and of images with the largest disagreement, in an explanation."""
+_MIN_DISAGREEMENT = 0.1
+"""Minimum disagreement of the images that an explanation shows as disagreeing."""
 _IMAGE_SIZE = 480
 _OVER_VIEWS, _CHANGED = (
     "Based on about {:.0f} images{}.",
@@ -53,7 +54,7 @@ def region_mask(served: ServedRun, state: State, value: protocol.Region | protoc
     drawn = state.drawn & served.visible
     mask &= visible_gaussians(scene.gaussians, camera, drawn, rasterize_mode=scene.rasterize_mode)
     if not bool(mask.any()):
-        raise InputError("There are no visible Gaussians in this region. Draw a larger region.")
+        raise InputError("This region has no visible Gaussians. Draw a larger region.")
     return mask
 
 
@@ -72,7 +73,8 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
         "reliability": 0.0 if query is None else query.min_reliability,
         "used_rule": None if query is None else query.rule,
         "used_negatives": [] if query is None else list(query.negatives),
-        "shown": state.shown, "color_mode": state.color_mode, "colormap": state.colormap, "legend": legend(state),
+        "shown": state.shown, "color_mode": state.color_mode, "colormap": state.colormap,
+        "legend": protocol.legend(state),
         "selected": int(selection.sum()),
         "selected_visible": int((selection & state.drawn).cpu().numpy()[rows].sum()),
         "hidden": int((~state.drawn).sum()), "total": len(state.space),
@@ -83,7 +85,7 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
     if not details:
         return content, ()
     if answer is not None and state.prompts_select:
-        colors = dict(zip(answer.texts, prompt_display_colors(state)))
+        colors = dict(zip(answer.texts, protocol.prompt_display_colors(state)))
         content["histogram"] = [
             {
                 "text": one.text, "color": colors[one.text], "warning": one.warning, "nearest": one.nearest_position,
@@ -99,7 +101,7 @@ def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[di
 def _prompts_json(state: State) -> list[dict[str, Any]]:
     """Return one row per prompt, with its result or its error."""
     answer = state.answer
-    colors = prompt_display_colors(state)
+    colors = protocol.prompt_display_colors(state)
     rows = []
     for prompt in state.prompts:
         row: dict[str, Any] = dict.fromkeys(("color", "verdict", "relevancy", "threshold", "count"))
@@ -152,7 +154,7 @@ def describe_hover(
 
 
 def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
-    """Return the content of the message `explanation`: the images with the largest weight and disagreement.
+    """Return the content of the message `explanation`: the images with the largest weight, and others that disagree.
 
     Raises:
         ValueError: Nothing is selected, or the votes of the images are no longer in the cache.
@@ -160,14 +162,18 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
     with served.analyzing:
         votes = served.run.votes
         why = votes.explain(state.selection.cpu(), refined=state.refined)
-        groups = {"support": why.views[:_MAX_IMAGES], "disagreement": why.most_different[:_MAX_IMAGES]}
+        support = why.views[:_MAX_IMAGES]
+        different = [
+            vote for vote in why.most_different if vote not in support and vote.disagreement >= _MIN_DISAGREEMENT
+        ]
+        groups = {"support": support, "disagreement": different[:_MAX_IMAGES]}
         images, problem = {}, None
         try:
             for picture in votes.pictures(dict.fromkeys(vote for group in groups.values() for vote in group)):
-                jpeg = to_jpeg(picture.image.cpu().numpy(), _IMAGE_SIZE)
-                images[picture.vote.view] = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+                images[picture.vote.view] = _data_url(to_jpeg(picture.image.cpu().numpy(), _IMAGE_SIZE))
         except (InputError, OSError) as error:
-            problem = without_paths(f"The images cannot be shown: {error}")
+            problem = without_paths(f"The regions that voted cannot be outlined: {error}")
+            images = _plain_images(served, [vote for group in groups.values() for vote in group]) | images
 
     def entry(vote: ViewVote) -> dict[str, Any]:
         facts = {"share": vote.share, "agreement": vote.agreement, "disagreement": vote.disagreement}
@@ -175,5 +181,20 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
 
     changed = _CHANGED.format(why.changed) if why.changed > 0 else ""
     facts = {"agreement": why.c_inter, "effective_views": why.n_eff, "problem": problem}
+    facts |= {"name": state.name, "selected": why.gaussians}
     votes_of = {name: [entry(vote) for vote in group] for name, group in groups.items()}
     return {"text": _OVER_VIEWS.format(max(1.0, why.n_eff), changed), **facts, **votes_of}
+
+
+def _plain_images(served: ServedRun, votes: Sequence[ViewVote]) -> dict[int, str]:
+    """Return the training images of votes as data URLs, without outlines; leave out images that cannot be read."""
+    names, images = served.run.scene.train.names, {}
+    for vote in votes:
+        with suppress(InputError, OSError, ValueError):
+            content = served.image(names.index(served.run.votes.names[vote.view]), _IMAGE_SIZE)
+            images[vote.view] = _data_url(content)
+    return images
+
+
+def _data_url(jpeg: bytes) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()

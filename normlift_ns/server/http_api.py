@@ -21,9 +21,8 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.errors import InputError
 from normlift_ns.evaluation.coverage import coverage
 from normlift_ns.server import schema
-from normlift_ns.server.coloring import make_codes
 from normlift_ns.server.describe import explanation_of
-from normlift_ns.server.protocol import decode
+from normlift_ns.server.protocol import decode, make_codes
 from normlift_ns.server.runs import ServedRun
 from normlift_ns.session.state import State
 

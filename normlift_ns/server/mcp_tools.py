@@ -30,8 +30,7 @@ import normlift_ns
 from normlift_ns.io.atomic import atomic_file, numbered_paths
 from normlift_ns.server import http_api, schema
 from normlift_ns.server.app import WarmServer
-from normlift_ns.server.coloring import ColorMode
-from normlift_ns.server.protocol import decode
+from normlift_ns.server.protocol import ColorMode, decode
 from normlift_ns.server.runs import ServedRun, without_paths
 
 _INSTRUCTIONS = """Search trained 3D scenes (Gaussian splats with semantics) by text.

@@ -108,7 +108,7 @@ def write_link(link: Link) -> str:
 
 
 def read_link(query: str) -> Link | None:
-    """Decode the link in the query string of a URL; return None if there is no link.
+    """Decode the link in the query string of a URL; return None if it has no link.
 
     Raises:
         ValueError: The link is truncated or damaged.

@@ -33,8 +33,8 @@ from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, join_prompts, load_query
 from normlift_ns.query.text_encoder import encoder_name, own_words
 from normlift_ns.rasterization.rasterize import ray_weights, render
-from normlift_ns.server.coloring import NOT_DRAWN, Codes, pca_of
 from normlift_ns.server.permalink import PageView
+from normlift_ns.server.protocol import NOT_DRAWN, Codes, pca_of
 from normlift_ns.session.objects import LookAtTarget, ObjectRow, unoccluded_viewpoint
 from normlift_ns.session.outputs import selection_bytes, store_query
 from normlift_ns.session.prompts import build_query, encode_prompts, prompts_of_query
@@ -243,7 +243,7 @@ class ServedRun:
         """
         for name, gaussian in clicks.items():
             if gaussian >= len(self.space):
-                raise InputError(f"{name}: there is no Gaussian {gaussian:,}. The link is for another scene.")
+                raise InputError(f"{name}: this scene has no Gaussian {gaussian:,}. The link is for another scene.")
         rows = self.space.field.directions(torch.tensor(list(clicks.values()), dtype=torch.long)).cpu().numpy()
         return {**self.stored(), **{name: row for name, row in zip(clicks, rows) if np.any(row)}}
 
@@ -298,7 +298,7 @@ class ServedRun:
         """Return a training image as JPEG, with at most `max_size` pixels along its longer side."""
         if not 0 <= index < len(self.run.scene.train):
             raise InputError(
-                f"There is no image {index}. The run has {len(self.run.scene.train)} images, numbered from 0."
+                f"The run has no image {index}. It has {len(self.run.scene.train)} images, numbered from 0."
             )
         return to_jpeg(self.run.scene.train[index].image.cpu().numpy(), max_size)
 
@@ -338,15 +338,23 @@ class ServedRun:
                 del self._memories[old]
             return found, token
 
-    def warm_up(self) -> None:
-        """Compute in advance the data that the first page needs."""
+    def warm_up(self, wait: Callable[[], None]) -> None:
+        """Compute in advance what `describe` returns, and then the further data that the first page needs.
+
+        Args:
+            wait: Function that returns when there is time for the next part of the further data.
+        """
         _ = self.geometry, self.examples
+        for part in (self._compile_renderer, lambda: self.space.neighbor_pairs, lambda: self.pca):
+            wait()
+            part()
+
+    def _compile_renderer(self) -> None:
         view = self.first_view
         if view is not None:
             codes = Codes([(0, 0, 0, 0.0, 0)], np.zeros(len(self.rows), np.uint8))
-            self.still(codes, view.camera(64))  # compiles the renderer
+            self.still(codes, view.camera(64))
             self.weights(view.position, np.subtract(view.look_at, view.position).tolist())
-        _ = self.space.neighbor_pairs, self.pca
 
     @property
     def in_use(self) -> bool:
@@ -407,7 +415,7 @@ class RunStore:
             ValueError: No run has this id, or the run cannot be opened.
         """
         if name not in self._configs:
-            raise InputError(f"There is no run {name!r}. Choose one of: {', '.join(self.ids)}.")
+            raise InputError(f"The server has no run {name!r}. Choose one of: {', '.join(self.ids)}.")
         with self._locks[name]:
             with self._lock:
                 if name in self._open:
@@ -422,13 +430,13 @@ class RunStore:
                         del self._open[other]
             return served
 
-    def warm_up(self) -> None:
-        """Compute in advance the data that the first page of each open run needs, one run after another."""
+    def warm_up(self, wait: Callable[[], None]) -> None:
+        """Compute in advance the data that the first page of each open run needs; see `ServedRun.warm_up`."""
         for name in self.ids:
             with self._lock:
                 served, _ = self._open.get(name, (None, 0))
             if served is not None:
-                served.warm_up()
+                served.warm_up(wait)
 
 
 def _estimated_bytes(run: LiftedRun) -> int:

@@ -13,10 +13,9 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import RelevancyRule
 from normlift_ns.query.engine import Answer
 from normlift_ns.query.question import Query, join_prompts
-from normlift_ns.server.coloring import ColorMode
 from normlift_ns.server.describe import region_mask
 from normlift_ns.server.permalink import Finite, PageView
-from normlift_ns.server.protocol import CameraValue, Ray, Region
+from normlift_ns.server.protocol import CameraValue, ColorMode, Ray, Region
 from normlift_ns.server.runs import ServedRun
 from normlift_ns.session import actions
 from normlift_ns.session.objects import ObjectRow, list_objects
@@ -275,7 +274,7 @@ def find_object(state: State, number: int) -> ObjectRow:
     """
     objects = list_objects(state, max_objects=MAX_OBJECTS).objects
     if number > len(objects):
-        raise InputError(f"There is no object {number}. The selection has {len(objects)} objects, numbered from 1.")
+        raise InputError(f"The selection has no object {number}. It has {len(objects)} objects, numbered from 1.")
     return objects[number - 1]
 
 

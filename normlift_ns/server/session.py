@@ -21,7 +21,6 @@ from normlift_ns.core.gaussians import Camera
 from normlift_ns.errors import InputError, describe_error
 from normlift_ns.query.question import join_prompts
 from normlift_ns.server import protocol
-from normlift_ns.server.coloring import COLOR_MODES, Codes, make_codes
 from normlift_ns.server.describe import (
     MAX_OBJECTS,
     describe_hover,
@@ -73,7 +72,7 @@ class Latest(Generic[T]):
 
     @property
     def empty(self) -> bool:
-        """True if there is no value."""
+        """True if the slot has no value."""
         return len(self._values) == 0
 
 
@@ -282,7 +281,8 @@ class PageSession:
         return self._visible(actions.click(state, weights, value.mode))  # pyright: ignore[reportArgumentType]
 
     def _select_object(self, state: State, value: protocol.ObjectAction) -> State:
-        return self._visible(actions.change_objects(state, self._object(value.id).mask, value.mode))
+        row = self._object(value.id)
+        return self._visible(actions.change_objects(state, row.mask, value.mode, row.text))
 
     def _select_region(self, state: State, value: protocol.Region | protocol.Brush) -> State:
         mask = region_mask(self._run, state, value)
@@ -464,7 +464,7 @@ class PageSession:
         if link is not None:
             memory.clicks |= {name: gaussian for name, gaussian in link.clicks.items() if is_click(name)}
             memory.view = link.view if link.view is not None and link.view.is_valid else memory.view
-            if link.look in COLOR_MODES:
+            if link.look in protocol.COLOR_MODES:
                 memory.history = memory.history.do(actions.set_color_mode(self._state, link.look))
         return link
 
@@ -501,8 +501,8 @@ class PageSession:
         }  # fmt: skip
         await self._send(type="state", revision=revision, seq=seq, **content)
 
-    def _codes(self, state: State) -> Codes:
-        return make_codes(state, self._run.rows, self._run.pca if state.color_mode == "pca" else None)
+    def _codes(self, state: State) -> protocol.Codes:
+        return protocol.make_codes(state, self._run.rows, self._run.pca if state.color_mode == "pca" else None)
 
     async def _hover_on(self) -> None:
         while True:

@@ -14,11 +14,11 @@ from torch import Tensor
 from normlift_ns.errors import InputError
 from normlift_ns.options import WEAK_RELIABILITY
 from normlift_ns.query.engine import Finding
-from normlift_ns.query.histograms import Histogram
 from normlift_ns.query.question import Query, join_prompts
+from normlift_ns.query.threshold import Histogram
 from normlift_ns.rendering.colors import RGB, clip_text, prompt_rgb_tuples
 from normlift_ns.session.prompts import Prompt, is_click
-from normlift_ns.session.state import Layer, State
+from normlift_ns.session.state import BY_HAND, Addition, Layer, State
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,11 +167,11 @@ def use_suggested_threshold(state: State) -> State:
     """Set the threshold that the relevancies of the selecting prompts suggest.
 
     Raises:
-        ValueError: There is no query.
+        ValueError: The state has no query.
     """
     value = threshold_suggestion(state)
     if value is None:
-        raise InputError("There is no query yet, so no threshold can be suggested. Type a prompt and press Ask.")
+        raise InputError("This session has no query to suggest a threshold for. Type a prompt and press Ask.")
     return set_threshold(state, value)
 
 
@@ -190,15 +190,17 @@ def remove_weak(state: State) -> State:
 
 
 def show_prompt(state: State, shown: int | None) -> State:
-    """Let only one prompt of the query, or all prompts, select Gaussians.
+    """Let only one prompt of the query, or all prompts, select Gaussians, in place of a selection made by hand.
 
     Args:
         shown: Index of the prompt; None for all prompts.
     """
     count = 0 if state.query is None else len(state.query.texts)
-    if shown == state.shown or (shown is not None and not 0 <= shown < count):
+    if (shown == state.shown and state.prompts_select) or not 0 <= (shown or 0) < count:
         return state
     text = "all prompts" if shown is None or state.query is None else state.query.texts[shown]
+    if not state.prompts_select:
+        state = replace(state, prompts_select=True, added=None, removed=None, additions=(), grow_steps=0)
     return replace(state, shown=shown, action=f"Show {text}")
 
 
@@ -216,7 +218,7 @@ def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
     weights = weights.where(state.space.field.valid(refined=state.refined) & state.drawn, 0.0)
     index = int(weights.argmax()) if len(weights) > 0 else 0
     if len(weights) == 0 or not float(weights[index]) > 0:
-        raise InputError("There is no Gaussian with semantics at this position. Click a visible object.")
+        raise InputError("This position has no Gaussian with semantics. Click a visible object.")
     return index
 
 
@@ -227,9 +229,9 @@ def object_under(state: State, gaussian: int) -> Bool[Tensor, " n"]:
     prompt selects the Gaussian, the object is a connected component of the best prompt's selection, which separates
     touching objects of different prompts. Otherwise, it is the result of `SelectionContext.object_at`.
     """
-    for mask in reversed(state.additions):
-        if bool(mask[gaussian]):
-            return mask
+    for one in reversed(state.additions):
+        if bool(one.mask[gaussian]):
+            return one.mask
     selection, answer = state.selection, state.answer
     if answer is not None and state.prompts_select and bool(selection[gaussian]):
         relevancy = answer.relevancy[gaussian].where(answer.selected[gaussian], -torch.inf)
@@ -248,12 +250,18 @@ def click(state: State, weights: Float[Tensor, " n"], mode: ClickMode = "select"
     return change_objects(state, object_under(state, pick_gaussian(state, weights)), mode)
 
 
-def change_objects(state: State, mask: Bool[Tensor, " n"], mode: ClickMode) -> State:
-    """Select, add or remove an object. Removing it later removes only the Gaussians that this step added."""
+def change_objects(state: State, mask: Bool[Tensor, " n"], mode: ClickMode, text: str = BY_HAND) -> State:
+    """Select, add or remove an object. Removing it later removes only the Gaussians that this step added.
+
+    Args:
+        text: Prompt of the object.
+    """
     before = () if mode == "select" else state.additions
     new = mask if mode == "select" else mask & ~state.selection
-    changed = change_selection(state, mask, mode, "an object")
-    return changed if mode == "remove" else replace(changed, additions=(*before, new))
+    changed = change_selection(state, mask, mode, "an object" if text == BY_HAND else text)
+    if mode == "remove" or not bool(new.any()):
+        return changed
+    return replace(changed, additions=(*before, Addition(text, new)))
 
 
 def change_selection(state: State, mask: Bool[Tensor, " n"], mode: ClickMode, what: str) -> State:
@@ -293,7 +301,8 @@ def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
 
 def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Remove") -> State:
     """Remove Gaussians from the selection. If it was grown or shrunk, the new one no longer depends on prompts."""
-    additions = tuple(mask for one in state.additions if bool((mask := one & ~chosen).any()))
+    additions = tuple(replace(one, mask=one.mask & ~chosen) for one in state.additions)
+    additions = tuple(one for one in additions if bool(one.mask.any()))
     if state.grow_steps != 0:
         return replace(select(state, state.selection & ~chosen, did), additions=additions)
     removed = chosen if state.removed is None else state.removed | chosen
@@ -392,5 +401,5 @@ def find_layer(state: State, name: str) -> Layer:
     """
     layer = next((layer for layer in state.layers if layer.name == name), None)
     if layer is None:
-        raise InputError(f"There is no layer {clip_text(name, 60)!r}. Choose one of the listed layers.")
+        raise InputError(f"This session has no layer {clip_text(name, 60)!r}. Choose one of the listed layers.")
     return layer

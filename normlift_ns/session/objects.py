@@ -15,11 +15,10 @@ from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.options import OBJECT_MIN_GAUSSIANS
 from normlift_ns.rasterization.rasterize import ray_weights
 from normlift_ns.rendering.colors import RGB, prompt_rgb_tuples
-from normlift_ns.session.state import WEAK_RELIABILITY, State
+from normlift_ns.session.state import BY_HAND, WEAK_RELIABILITY, State
 
 _STRONG = 0.8
 """Minimum reliability R of strong evidence."""
-_BY_HAND = "selected by hand"
 _BY_HAND_COLOR = (1.0, 0.75, 0.1)
 
 
@@ -74,26 +73,34 @@ def list_objects(state: State, *, max_objects: int = 12, min_gaussians: int = OB
     """Return the objects among the selected and drawn Gaussians, for each prompt or for a selection made by hand.
 
     Args:
-        max_objects: Maximum number of listed objects; the largest object of each prompt has priority.
+        max_objects: Maximum number of listed objects; the largest object of each prompt has priority. An object that
+            was selected or added by hand stays one object, unless the selection was grown or shrunk.
         min_gaussians: Minimum number of Gaussians in an object; those in smaller components are only counted.
     """
     selected, answer = state.selection & state.drawn, state.answer
+    rows: list[tuple[int, int, str, RGB, Tensor, int]] = []
     if answer is None or not state.prompts_select:
-        groups = [(_BY_HAND, _BY_HAND_COLOR, selected)]
+        parts = [(one.text, one.mask & selected) for one in state.additions if state.grow_steps == 0]
+        for group, (text, mask) in enumerate(parts):
+            if int(mask.sum()) >= min_gaussians:
+                number = sum(row[2] == text for row in rows)
+                rows.append((number, group, text, _BY_HAND_COLOR, mask, int(mask.sum())))
+                selected = selected & ~mask
+        groups = [(BY_HAND, _BY_HAND_COLOR, selected)]
     else:
         prompts = range(len(answer.texts)) if state.shown is None else [state.shown]
         colors = prompt_rgb_tuples(answer.texts)
         groups = [(answer.texts[q], colors[q], selected & answer.selected[:, q]) for q in prompts]
-    rows, small = [], 0
-    for group, (text, color, mask) in enumerate(groups):
-        labels = connected_components(state.space.means, mask)
+    small = 0
+    for group, (text, color, mask) in enumerate(groups, len(rows)):
+        labels, first = connected_components(state.space.means, mask), sum(row[2] == text for row in rows)
         sizes = torch.bincount(labels[labels >= 0].long()).tolist()
         count = sum(size >= min_gaussians for size in sizes)
         small += sum(sizes[count:])
-        rows += [(number, group, text, color, labels, size) for number, size in enumerate(sizes[:count])]
+        rows += [(first + n, group, text, color, labels == n, size) for n, size in enumerate(sizes[:count])]
     listed = sorted(sorted(rows, key=lambda row: row[:2])[:max_objects], key=lambda row: (row[1], row[0]))
-    objects = [_object(state, text, n, color, labels == n, size) for n, _, text, color, labels, size in listed]
-    return ObjectList(tuple(objects), len(rows) - len(listed), small)
+    objects = tuple(_object(state, text, n, color, mask, size) for n, _, text, color, mask, size in listed)
+    return ObjectList(objects, len(rows) - len(listed), small)
 
 
 def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size: int) -> ObjectRow:

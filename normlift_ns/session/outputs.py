@@ -29,10 +29,10 @@ def store_query(folder: Path | None, query: Query | None, *, replaces: bool = Fa
         folder: Folder of the field.
         replaces: True to delete the prompts that the run already stores, False to keep them.
     Raises:
-        ValueError: There is no query or no folder, or `merge_queries` cannot merge the queries.
+        ValueError: The query or the folder is missing, or `merge_queries` cannot merge the queries.
     """
     if query is None or folder is None:
-        raise InputError("There is no query yet, so there are no prompts to save. Type a prompt and press Ask.")
+        raise InputError("This session has no query yet, so it has no prompts to save. Type a prompt and press Ask.")
     merged = merge_queries(None if replaces else load_query(folder), query)
     save_query(folder, merged)
     return "one prompt" if len(merged.texts) == 1 else f"{len(merged.texts)} prompts"

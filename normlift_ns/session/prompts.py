@@ -33,7 +33,7 @@ class Prompt:
     vector: Float[np.ndarray, " d"] | None = None
     """Vector of the prompt; None if it has an error."""
     error: str = ""
-    """Error message for the user; empty if there is no error."""
+    """Error message for the user; empty without an error."""
 
     @property
     def is_click(self) -> bool:

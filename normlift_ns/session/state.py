@@ -30,6 +30,19 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False)
+class Addition:
+    """Gaussians that an object contributed to the selection when it was selected or added."""
+
+    text: str
+    """Prompt of the object, or `BY_HAND`."""
+    mask: Bool[Tensor, " n"]
+
+
+BY_HAND = "selected by hand"
+"""Text of objects that no prompt found."""
+
+
+@dataclass(frozen=True, eq=False)
 class State:
     """Immutable state of one user's view, without the camera; its masks are never modified.
 
@@ -48,8 +61,8 @@ class State:
     """True if the prompts select; False if the selection was made by hand."""
     added: Bool[Tensor, " n"] | None = None
     removed: Bool[Tensor, " n"] | None = None
-    additions: tuple[Bool[Tensor, " n"], ...] = ()
-    """Masks of the Gaussians that each added object contributed to the selection, in order of addition."""
+    additions: tuple[Addition, ...] = ()
+    """Objects that were selected or added, in this order."""
     grow_steps: int = 0
     """Number of growing steps over the neighbor graph; a negative number shrinks the selection."""
     hidden: Bool[Tensor, " n"] | None = None
@@ -96,9 +109,10 @@ class State:
 
     @property
     def name(self) -> str:
-        """Name for a file of the selection: the prompts that select, or "selection" without such prompts."""
+        """Name for a file of the selection: the prompts that select, or those of selected objects, else "selection"."""
         if self.query is None or not self.prompts_select:
-            return "selection"
+            texts = tuple(dict.fromkeys(one.text for one in self.additions))
+            return join_prompts(texts) if texts != () and BY_HAND not in texts else "selection"
         texts = self.query.texts
         return join_prompts(texts if self.shown is None else texts[self.shown : self.shown + 1])
 

@@ -21,7 +21,7 @@ from normlift_ns.session.prompts import build_query, click_name, encode_prompts,
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
 from normlift_ns.viewer.widgets import ALL_PROMPTS, SLIDERS, Action, Explanation
 
-NO_FIELD_MESSAGE = "There are no semantics yet. The lift runs at the end of training."
+NO_FIELD_MESSAGE = "This scene has no semantics yet. The lift runs at the end of training."
 _CLICK_MODES: dict[Action, ClickMode] = {Action.SELECT: "select", Action.ADD: "add", Action.REMOVE: "remove"}
 
 
@@ -57,7 +57,7 @@ class Session:
     """Queries and clicks of one user, kept while the viewer runs."""
 
     history: History[State] | None = None
-    """History of states; None if there is no field yet."""
+    """History of states; None before the first field."""
     line: str = ""
     """Text in the prompt box."""
     clicks: dict[str, Any] = field(default_factory=dict)
@@ -108,7 +108,7 @@ class Controller(ABC):
 
     @property
     def state(self) -> State | None:
-        """Current state; None if there is no field yet."""
+        """Current state; None before the first field."""
         return None if self._session.history is None else self.history.now
 
     def act(self, action: Action, value: Any = None, client: Any = None) -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from normlift_ns.analysis.explain import RecordedVotes, ViewVote
 from normlift_ns.errors import InputError, escape_unprintable
-from normlift_ns.query.histograms import Histogram
+from normlift_ns.query.threshold import Histogram
 from normlift_ns.rendering.colors import clip_text, prompt_rgb_tuples
 from normlift_ns.session.actions import MAX_THRESHOLD, MIN_THRESHOLD, diagnose_prompts
 from normlift_ns.session.objects import ObjectList, ObjectRow
@@ -267,7 +267,7 @@ def histogram_svg(histogram: Histogram, color: Sequence[float]) -> str:
         color: Color of the bars above the threshold, RGB in 0..1.
 
     >>> values = np.array([0.1] * 60 + [0.9] * 10)
-    >>> from normlift_ns.query.histograms import relevancy_histogram
+    >>> from normlift_ns.query.threshold import relevancy_histogram
     >>> counts = relevancy_histogram(values, np.ones(70, bool), 0.5, (0.4, 0.8))
     >>> histogram_svg(counts, (1, 0, 0)).count("#ff0000")
     1

@@ -50,6 +50,7 @@ def test_votes_are_the_sums_that_the_module_says(seed, share, copies):
     unit = torch.nn.functional.normalize(torch.as_tensor(dense) @ torch.as_tensor(table), dim=1).numpy()
     cosine = (unit[rows] * unit[np.flatnonzero(selected)]).sum(1)[rows != np.flatnonzero(selected)]
     assert abs(cosine - 0.98).min(initial=1) < 1e-6 or why.changed == (cosine < 0.98).sum() / why.gaussians
+    assert why.copied == (rows != np.flatnonzero(selected)).sum()
     if weight.sum() == 0:
         assert why.views == ()
         assert why.words and not any(letter.isdigit() for letter in why.words)

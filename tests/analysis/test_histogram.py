@@ -11,13 +11,8 @@ from normlift_ns import InputError, SemanticField
 from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.encoders.registry import EncoderKind
 from normlift_ns.query import engine
-from normlift_ns.query.histograms import (
-    HISTOGRAM_BINS,
-    draw_histogram,
-    relevancy_histogram,
-    suggest_threshold,
-)
 from normlift_ns.query.question import Query, make_query, save_query
+from normlift_ns.query.threshold import HISTOGRAM_BINS, draw_histogram, relevancy_histogram, suggest_threshold
 from tests.examples import examples
 from tests.io.test_field import D, example
 from tests.random_scenes import unit_rows

@@ -68,7 +68,7 @@ def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch,
     document = scored("masks", capture / "instance", *flags)
     results, tables = document["results"], document["studies"]
     told = said(capsys)
-    assert all(word in told for word in ("miou_3d", "spearman_bins", "drsplat", "SFS"))
+    assert all(word in told for word in ("miou_3d", "spearman_bins", "drsplat", "Splat Feature Solver"))
     assert ("GPU" in told) != torch.cuda.is_available()
     assert (document["experiment_name"], document["method_name"]) == ("room", "normlift")
     assert results["miou_3d"] > 0.5 and results["miou_2d"] > 0.4

@@ -49,7 +49,7 @@ def config(tmp_path: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def nothing_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("api.lift_run", "lifted_run.open_run"):
+    for name in ("pipeline.lift_run", "lifted_run.open_run"):
         monkeypatch.setattr(f"normlift_ns.{name}", None)
 
 

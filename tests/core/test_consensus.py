@@ -18,7 +18,8 @@ from normlift_ns.core.consensus import (
     sample_gaussians,
     with_original_reliability,
 )
-from normlift_ns.core.lift import lift, norm_of_reliability
+from normlift_ns.core.lift import lift
+from normlift_ns.core.reliability import norm_of_reliability
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
 from tests.examples import examples
@@ -301,6 +302,7 @@ def test_norm_before_the_consensus_follows_from_its_reliability(seed: int) -> No
     evidence, features = things(seed), unit_rows(20, 6, seed)
     before = lift(evidence, features, beta=2.0).scalars
     after = lift(evidence, consensus(evidence, features, least=0.0).features, beta=2.0).scalars
-    norm = norm_of_reliability(with_original_reliability(after, before), beta=2.0)
+    kept = with_original_reliability(after, before)
+    norm = norm_of_reliability(kept.reliability, kept.n_eff, beta=2.0)
     assert torch.allclose(norm, torch.where(after.norm > 0, before.norm, 0.0), atol=1e-12)
     assert not torch.allclose(norm, after.norm, atol=1e-3)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from normlift_ns import lift, nearest_neighbors
-from normlift_ns.core.gate import relative_gate, sample_pairs, shared_region_cosines
+from normlift_ns.core.refine import relative_gate, sample_pairs, shared_region_cosines
 from tests.random_scenes import dense, generator, random_evidence, unit_rows
 
 COUNTS = [3, 2, 4, 1, 3, 2]

@@ -70,3 +70,9 @@ def test_a_vote_of_nobody_says_so():
         with pytest.warns(UserWarning, match=f"{n} Gaussian"):
             source = refine(torch.zeros(n, 3), torch.ones(n, 1), torch.ones(n), own=torch.ones(n))
         assert source.tolist() == list(range(n))
+
+
+def test_entries_of_an_empty_scene_are_refused():
+    entries = Entries(torch.tensor([0]), torch.tensor([0]), torch.ones(1), num_regions=(1,))
+    with pytest.raises(ValueError, match=r"gaussian must be in 0\.\.-1, got 0"):
+        Evidence.from_entries([entries], 0)

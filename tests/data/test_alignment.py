@@ -176,7 +176,7 @@ def test_one_wrong_photograph_of_three_is_named(scene) -> None:
         match = measure_alignment(Changed(scene, change))
         assert match.psnr > 24 > match.worst[1] and match.worst[0] == name
         warning = alignment_warning(match, trained_cameras=True)
-        assert warning is not None and f"{name}, one of three training images" in warning
+        assert warning is not None and f"{name}, one of the training images" in warning
 
 
 def test_masked_pixels_do_not_count(scene) -> None:

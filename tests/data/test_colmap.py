@@ -78,7 +78,7 @@ def test_the_largest_of_several_reconstructions_is_read(tmp_path: Path) -> None:
     said: list[str] = []
     for folder in (tmp_path / "p", tmp_path / "p" / "sparse"):
         assert find_colmap_model(folder, said.append) == tmp_path / "p" / "sparse" / "1"
-        assert all(part in said[-1] for part in ("0 with 2 images", "1 with 5 images", "10 with 3 images", "--colmap"))
+        assert all(part in said[-1] for part in ("0 (images: 2)", "1 (images: 5)", "10 (images: 3)", "--colmap"))
     assert find_colmap_model(tmp_path / "p" / "sparse" / "0", said.append).name == "0"
     (tmp_path / "p" / "sparse" / "1" / "images.txt").write_text("damaged")
     assert find_colmap_model(tmp_path / "p").name == "10"
@@ -186,7 +186,7 @@ def test_what_no_reconstruction_has_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="same ID"):
         read_colmap_model(folder)
     (folder / "images.txt").write_text("# none")
-    with pytest.raises(InputError, match="0 registered images"):
+    with pytest.raises(InputError, match="registered images: 0"):
         read_colmap_model(folder)
 
 

@@ -13,9 +13,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from normlift_ns.data.cameras import read_camera_file
+from normlift_ns.data.compressed_ply import normalize_quats
 from normlift_ns.data.frames import Frame, Intrinsics
 from normlift_ns.data.open_splat import _read, open_splat
-from normlift_ns.data.quantization import normalize_quats
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.data.transforms import write_transforms
 from normlift_ns.errors import InputError

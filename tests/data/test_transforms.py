@@ -85,7 +85,7 @@ def test_images_and_masks_from_other_folders(tmp_path: Path) -> None:
     assert [frame.name for frame in found] == ["images_2/a.png", "images_2/b.png"]
     assert [frame.mask for frame in found] == [tmp_path / "b/masks/a.png.png", tmp_path / "b/masks/b.png"]
     (tmp_path / "b/masks/b.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"no mask for .*b\.png in .*masks"):
+    with pytest.raises(FileNotFoundError, match=r"masks has no mask for .*b\.png"):
         read_transforms(path, None, tmp_path / "b" / "masks")
 
 
@@ -123,7 +123,7 @@ def test_paths_of_another_machine(tmp_path: Path, start: str) -> None:
         assert found.held_out == {names[1]}
     (tmp_path / "scene" / names[0]).unlink()
     options = SplatOptions(transforms=path, images=tmp_path / "scene" / "images")
-    with pytest.raises(FileNotFoundError, match=r"1 of the 2 images .*remove them from the camera file") as caught:
+    with pytest.raises(FileNotFoundError, match=r"1 of 2, .*remove them from the camera file") as caught:
         read_camera_file(options)
     assert "--images" not in str(caught.value)  # which was given
 
@@ -168,7 +168,7 @@ def test_nan_and_missing_files_are_named(tmp_path: Path) -> None:
         read_transforms(path)
     path.write_text(whole)
     (tmp_path / "images" / "b.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"1 of the 2 .* images/b.png"):
+    with pytest.raises(FileNotFoundError, match=r"1 of 2, .* images/b.png"):
         read_transforms(path)
     with pytest.raises(InputError, match="no cameras"):
         check_frames([], path)

@@ -19,7 +19,7 @@ def test_view_features_accept_what_fits_and_refuse_the_rest():
         (none.float(), UNIT, ["labels", "torch.int32"]),
         (none.flatten(), UNIT, ["labels", "torch.int32"]),
         (none, UNIT.double(), ["features", "torch.float32"]),
-        (none + 2, UNIT, ["-1..1", "2 cells", "2..2"]),
+        (none + 2, UNIT, ["-1..1", "number of cells: 2", "2..2"]),
         (none - 2, UNIT, ["-2..-2"]),
         (none, 2 * UNIT, ["2 of 2", "row 0 has length 2"]),
         (none, UNIT * torch.tensor([[1.0], [torch.nan]]), ["row 1 has length nan"]),
@@ -46,8 +46,8 @@ def test_regions_of_cells_must_have_features():
     assert torch.equal(view.region_of_cell, view.regions)
     assert ViewFeatures(labels.clamp(max=1), UNIT).region_of_cell.tolist() == [[0, 1]]
     for regions, parts in (
-        ([[0, 2, 1]], ["regions", "-1..1", "2 feature rows", "0..2"]),
-        ([[0, 1]], ["labels", "-1..1", "2 cells", "-1..2"]),
+        ([[0, 2, 1]], ["regions", "-1..1", "number of feature rows: 2", "0..2"]),
+        ([[0, 1]], ["labels", "-1..1", "number of cells: 2", "-1..2"]),
         ([0, 1, 0], ["regions", "torch.int32"]),
     ):
         given = torch.tensor(regions, dtype=torch.int32)
@@ -85,7 +85,7 @@ def test_regions_without_a_feature_are_unlabeled(kind, tmp_path):
             assert region[::2, ::2].tolist() == [[0, -1], [1, -1]]
             assert torch.equal(view.features, torch.eye(4)[::2])
         assert encoder.calls == 2
-    refused(lambda: plugin.text(["a"]), "'blind'", "length is not 1")
+    refused(lambda: plugin.text(["a"]), "'blind'", "expected 1")
 
 
 def test_other_images_and_texts_are_refused():

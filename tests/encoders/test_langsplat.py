@@ -129,7 +129,7 @@ def test_maps_and_tables_of_every_type(folder):
         assert_close(source(folder).view(IMAGE, NAME), expected(L))
     # -1 becomes 255, which is past the table
     put_map(folder, [[[value % 256 for value in row] for row in c] for c in CHANNELS], descr="|u1")
-    with pytest.warns(UserWarning, match=r"_s\.npy: channels 0, 1, 2, 3 .* 7 rows .*\(255\)"):
+    with pytest.warns(UserWarning, match=r"_s\.npy has ids past .*ids: 255; channels: 0, 1, 2, 3;"):
         assert_close(source(folder).view(IMAGE, NAME), expected(L))
 
 
@@ -190,7 +190,7 @@ def test_missing_frames_are_listed_and_refused_or_left_out(folder):
     lenient = source(folder, missing="skip")
     with pytest.warns(UserWarning, match=r"2 of 3 .*images/frame_00002\.jpg, images/frame_00003\.jpg"):
         assert lenient.available(names) == [NAME]
-    refused(lambda: lenient.available(names[1:2]), "1 of 1", error=FileNotFoundError)
+    refused(lambda: lenient.available(names[1:2]), "1 of 1", "--features-dir", error=FileNotFoundError)
     refused(lambda: source(folder).view(IMAGE, names[1]), "frame_00002.jpg", error=FileNotFoundError)
 
 
@@ -214,7 +214,7 @@ def test_names_end_at_the_first_dot_or_the_last(folder):
 def test_what_names_no_row_counts_as_unlabelled(folder):
     """Ids past the table, garbage in place of ids, rows that are zero or not finite."""
     put_table(folder, rows()[:6])
-    with pytest.warns(UserWarning, match=r"_s\.npy: channels 3 .*6 rows of its table \(6\), in 4 pix"):
+    with pytest.warns(UserWarning, match=r"_s\.npy has ids past .*ids: 6; channels: 3; pixels: 4"):
         view = source(folder).view(IMAGE, NAME)
     assert_close(view, expected([[5, 5, X, X], [5, 5, X, X], [5, 5, X, X]]))
     put_table(folder, rows())
@@ -223,16 +223,18 @@ def test_what_names_no_row_counts_as_unlabelled(folder):
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             assert_close(source(folder).view(IMAGE, NAME), expected([[X, 5, 6, 6], *L[1:]]))
-        assert [f"({garbage}), in 1 pixels" in str(one.message) for one in told] == [True] * (garbage != -7)
+        assert [f"(ids: {garbage}; channels: 3; pixels: 1)" in str(one.message) for one in told] == [True] * (
+            garbage != -7
+        )
     put_map(folder)
     for wrong in (float("nan"), float("inf"), 0.0):
         table = rows()
         table[5] = [wrong] * D if wrong == 0 else [*table[5][:-1], wrong]
         put_table(folder, table)
-        with pytest.warns(UserWarning, match=r"_f\.npy: rows 5 "):
+        with pytest.warns(UserWarning, match=r"_f\.npy has rows .*: 5;"):
             view = source(folder).view(IMAGE, NAME)
         assert_close(view, expected([[X, X, 6, 6], [X, X, 6, 6], [X] * 4]))
-        with pytest.warns(UserWarning, match="rows 5"):
+        with pytest.warns(UserWarning, match=": 5;"):
             view = source(folder, "sum").view(IMAGE, NAME)
         without = [[[X if value == 5 else value for value in row] for row in channel] for channel in CHANNELS]
         assert_close(view, torch.nn.functional.normalize(sum(expected(channel) for channel in without), dim=2))

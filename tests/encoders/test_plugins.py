@@ -115,9 +115,9 @@ def test_what_another_package_makes_is_checked(tmp_path: Path) -> None:
     image, labels = torch.zeros(4, 2, 3, dtype=torch.uint8), torch.arange(2).repeat(4, 1)[None].int()
     for number, (rows, made, parts) in enumerate((
         ("torch.ones(2, 3)", "Wrong()", ["1.73"]),
-        ("torch.eye(3)", "Wrong()", ["torch.float32 (3, 3)", "2 regions", "[2, D]"]),
-        ("None", "Wrong()", ["NoneType", "2 regions"]),
-        ("torch.eye(2) / torch.zeros(1)", "Wrong()", ["whose length is not 1"]),
+        ("torch.eye(3)", "Wrong()", ["torch.float32 (3, 3)", "per region", "[2, D]"]),
+        ("None", "Wrong()", ["NoneType", "per region"]),
+        ("torch.eye(2) / torch.zeros(1)", "Wrong()", ["expected 1"]),
         ("1 / 0", "Wrong()", ["'wrong'", "ZeroDivisionError"]),
         ("0", "object()", ["identity", "encode", "text"]),
         ("0", "missing", ["'wrong'", "NameError"]),

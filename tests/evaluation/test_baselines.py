@@ -19,7 +19,7 @@ from normlift_ns.evaluation.protocols import EvaluatedRun
 from normlift_ns.evaluation.studies import study_ablation, study_timing, voting_scalars
 from normlift_ns.evidence_collection import cells_to_regions
 from normlift_ns.pipeline import lift_scene
-from normlift_ns.rasterization.backend import RasterJob
+from normlift_ns.rasterization.rasterize import RasterJob
 from tests.random_scenes import Photographs, dense, generator, made_scene, orbit, random_scene
 
 N, VIEWS, HEIGHT, WIDTH = 300, 5, 35, 40

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from normlift_ns import Camera, GaussianScene, RasterSettings
 from normlift_ns.rasterization import triton
-from normlift_ns.rasterization.backend import RasterBatch, RasterJob
 from normlift_ns.rasterization.projection import assign_tiles, camera_depths, prepare_gaussians, project
+from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
 from tests.examples import examples
 from tests.kernels.test_regions import DEVICE, NEEDLES, hard_scene
 from tests.random_scenes import generator, orbit, random_labels, random_scene

@@ -7,7 +7,7 @@ from normlift_ns import Evidence, GaussianScene, RasterSettings, rasterize_evide
 from normlift_ns.core.evidence import MASKED, UNLABELED
 from normlift_ns.kernels import compositing
 from normlift_ns.rasterization import triton
-from normlift_ns.rasterization.backend import RasterBatch, RasterJob
+from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
 from tests.random_scenes import dense, generator, orbit, random_labels, random_scene
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"

@@ -11,11 +11,11 @@ import torch
 import yaml
 
 from normlift_ns import SemanticField, lift, rasterize_evidence
-from normlift_ns.api import write_run
 from normlift_ns.data.nerfstudio.config import dump_config, read_trainer_config
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.data.open_scene import load_field
 from normlift_ns.io.run_dir import run_directory
+from normlift_ns.lifted_run import write_run
 from normlift_ns.options import SourceOptions
 from normlift_ns.query.question import Query
 from normlift_ns.query.text_encoder import encoder_settings

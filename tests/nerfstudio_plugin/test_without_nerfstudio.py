@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from normlift_ns.api import _lifted_config
 from normlift_ns.data.nerfstudio import config_classes
 from normlift_ns.data.nerfstudio.config import dump_config, set_dataset, skip_seed_points
 from normlift_ns.data.nerfstudio.config_classes import NAMED_COLORS
@@ -27,6 +26,7 @@ from normlift_ns.data.nerfstudio.dataparsers import parse_dataset
 from normlift_ns.data.nerfstudio.load import TrainedViews
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER
+from normlift_ns.lifted_run import _lifted_config
 from tests.examples import examples
 from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import StockRun

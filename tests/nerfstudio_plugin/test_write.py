@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from normlift_ns import InputError, SemanticField
-from normlift_ns.api import write_run
 from normlift_ns.io import atomic
 from normlift_ns.io.run_dir import cache_folder, read_manifest, run_directory, write_manifest
+from normlift_ns.lifted_run import write_run
 from normlift_ns.query.question import Query, load_query
 from tests.nerfstudio_plugin.conftest import field_of, opened, read, write
 from tests.nerfstudio_plugin.stock_run import StockRun, working_directory

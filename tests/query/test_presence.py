@@ -14,8 +14,9 @@ from normlift_ns.core.null_level import with_null_level
 from normlift_ns.encoders.null_words import null_vectors, null_words
 from normlift_ns.io.field import read_field
 from normlift_ns.query.arrays import ArrayField
-from normlift_ns.query.engine import judge, null_rank, run_query
+from normlift_ns.query.engine import run_query
 from normlift_ns.query.question import Query, make_query
+from normlift_ns.query.threshold import judge, null_rank
 from tests.io.test_field import D, example
 from tests.random_scenes import unit_rows
 

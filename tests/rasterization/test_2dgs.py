@@ -7,7 +7,7 @@ import torch
 
 from normlift_ns import GaussianScene, RasterSettings, rasterize_evidence, render
 from normlift_ns.rasterization import gsplat
-from normlift_ns.rasterization.backend import RasterJob
+from normlift_ns.rasterization.rasterize import RasterJob
 from tests.kernels.test_regions import assert_same, hard_scene, kernel_evidence
 from tests.random_scenes import dense, generator, orbit, orbit_camera, random_labels, random_scene
 from tests.rasterization.oracle import compositing_matrix_2d

@@ -10,7 +10,7 @@ import torch
 from normlift_ns import Camera, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine, render
 from normlift_ns.core import device
 from normlift_ns.rasterization import gsplat, triton
-from normlift_ns.rasterization.backend import RasterBatch, RasterJob
+from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
 from tests.captures import SHARED, fixture_view, needs_shared, trained_scene, training_cameras, weight_fixtures
 from tests.kernels.test_regions import hard_scene
 from tests.random_scenes import dense, generator, orbit, random_labels, random_scene, unit_rows

@@ -10,8 +10,8 @@ import torch
 from normlift_ns import GaussianScene, RasterSettings, rasterize_evidence, render
 from normlift_ns.options import GSPLAT_VERSIONS
 from normlift_ns.rasterization import gsplat, triton
-from normlift_ns.rasterization.backend import RasterBatch, RasterJob
 from normlift_ns.rasterization.projection import assign_tiles, prepare_gaussians, project
+from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
 from tests.kernels.test_regions import DEVICE, hard_scene
 from tests.random_scenes import dense, generator, orbit, random_labels, random_scene
 from tests.rasterization.oracle import compositing_matrix

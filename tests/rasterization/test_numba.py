@@ -15,10 +15,9 @@ import torch
 import normlift_ns
 from normlift_ns import Camera, GaussianScene, RasterSettings, rasterize_evidence, render
 from normlift_ns.rasterization import numba as backend
-from normlift_ns.rasterization import numba_kernels as kernels
-from normlift_ns.rasterization.backend import RasterBatch, RasterJob
-from normlift_ns.rasterization.numba_kernels import cached_njit
+from normlift_ns.rasterization.numba import cached_njit
 from normlift_ns.rasterization.projection import assign_tiles
+from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
 from tests.random_scenes import dense, generator, orbit_camera, random_labels, random_scene
 
 DTYPES = [torch.float32, torch.float64]
@@ -53,12 +52,12 @@ def test_culling_of_tiles_and_rows_leaves_the_sums_bitwise(dtype, seed, primitiv
     offsets, members = tiles.offsets.numpy(), tiles.indices.numpy()
     everywhere = np.zeros_like(shapes)
     everywhere[:, 2] = np.inf  # every row of a tile
-    most = np.diff(offsets) * kernels.count_labels(labels.numpy(), 16)
+    most = np.diff(offsets) * backend.count_labels(labels.numpy(), 16)
     first, used = np.cumsum(most) - most, np.zeros(len(most), np.int64)
     slots = tuple(np.empty(most.sum(), t) for t in (np.int32, np.int32, np.float64))
     regions = (projected.gaussian.numpy(), labels.numpy(), 1, 16)
-    kernels.sum_tiles(offsets, members, *arrays, everywhere, *regions, limits, first, used, slots, 3)
-    expected = kernels.merge_slots(first, used, slots, 300, 7)
+    backend.sum_tiles(offsets, members, *arrays, everywhere, *regions, limits, first, used, slots, 3)
+    expected = backend.merge_slots(first, used, slots, 300, 7)
     found = backend.views_evidence(job, RasterBatch([camera], [labels], [6]))
     for got, exact in zip(found[:3], expected):
         assert torch.equal(got, torch.from_numpy(exact).to(got.dtype))
@@ -101,7 +100,7 @@ def test_exp_is_exact_to_the_last_bits(dtype, bound):
     @numba.njit
     def fill(values, found):
         for i in range(len(values)):
-            found[i] = kernels.exp(values[i])
+            found[i] = backend.exp(values[i])
 
     draw = np.random.default_rng(0)
     x = np.concatenate([[0, -1e30, -np.inf], *(draw.uniform(low, 0, 100_000) for low in (-1e-3, -6.0, -80.0))])

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from normlift_ns import GaussianScene, RasterSettings, rasterize_evidence, render
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.rasterization import triton
-from normlift_ns.rasterization.backend import RasterBatch, RasterJob
+from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
 from tests.examples import examples
 from tests.kernels.test_regions import DEVICE, hard_scene
 from tests.random_scenes import dense, orbit, orbit_camera, random_labels, random_scene

@@ -282,15 +282,16 @@ def test_runs_that_cannot_be_opened_are_not_listed(tmp_path, monkeypatch):
         return make_served(tmp_path).run
 
     monkeypatch.setattr(runs_module, "_estimated_bytes", lambda run: 10)
-    monkeypatch.setattr(runs_module.ServedRun, "warm_up", lambda served: warm.append(served.id))
+    monkeypatch.setattr(runs_module.ServedRun, "warm_up", lambda served, wait: warm.append(served.id))
     configs = [tmp_path / name / "normlift" / "one" / "config.yml" for name in ("fox", "castle", "room")]
     broken, store = {"fox", "castle", "room"}, RunStore(configs, open_one, memory_limit=5)
-    with client_of(WarmServer(store, ServerOptions())) as client:
+    server = WarmServer(store, ServerOptions())
+    with client_of(server) as client:
         answer = client.get("/api/runs")
         assert answer.status_code == 400 and answer.json()["error"] == "config.yml is missing"
         broken -= {"fox", "room"}
         assert [run["id"] for run in client.get("/api/runs").json()["runs"]] == ["fox-one", "room-one"]
-    store.warm_up()
+    server.warm_up()
     assert warm == ["room-one"]  # fox-one does not fit into the memory
 
 

@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 
 from normlift_ns import GaussianScene
-from normlift_ns.server.coloring import Codes
 from normlift_ns.server.permalink import PageView
+from normlift_ns.server.protocol import Codes
 from normlift_ns.server.runs import ServedRun, without_paths
 from tests.server.pages import make_served
 from tests.session.worlds import BLOCK, world

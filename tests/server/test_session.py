@@ -201,8 +201,11 @@ def test_floaters_growth_reliability_and_reasons(page, served):
     why = page.do("explain", until="explanation")
     assert "images" in why["text"] and why["support"][0]["url"].startswith("data:image/jpeg;base64,")
     served.run.votes = FakeVotes(FileNotFoundError("/data/me/b.png is missing"))
+    served.run.scene.train.names[0] = FakeVotes.names[0]
     why = page.do("explain", until="explanation")
-    assert why["support"][0]["url"] is None and "b.png" in why["problem"] and "/data" not in why["problem"]
+    assert "b.png" in why["problem"] and "/data" not in why["problem"] and why["name"] == "blue"
+    assert why["support"][0]["url"].startswith("data:image/jpeg;base64,")  # the image without outlines
+    assert not {vote["name"] for vote in why["support"]} & {vote["name"] for vote in why["disagreement"]}
 
 
 def test_downloads_and_stills(page, client, served):

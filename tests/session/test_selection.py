@@ -170,6 +170,21 @@ def test_objects_are_listed_with_what_their_buttons_need():
     assert [row.name for row in by_hand.objects] == ["selected by hand 1"]
 
 
+def test_an_object_of_the_list_stays_one_object_with_its_name():
+    state, both = asked("red, blue"), rows(0, 1)  # two cubes, which are two components
+    one = actions.change_objects(state, both, "select", "red")
+    assert [(row.name, row.size) for row in list_objects(one).objects] == [("red 1", 2 * BLOCK)]
+    assert one.name == "red" and torch.equal(one.selection, both)
+    more = actions.click(actions.click(one, ray(0), "add"), ray(2 * BLOCK), "add")
+    assert [row.name for row in list_objects(more).objects] == ["red 1", "selected by hand 1"]
+    assert more.name == "selection" and not more.prompts_select
+    part = actions.change_objects(more, rows(0), "remove", "red")
+    assert [row.name for row in list_objects(part).objects] == ["red 1", "selected by hand 1"]
+    assert [row.size for row in list_objects(part).objects] == [BLOCK, BLOCK]
+    back = actions.show_prompt(part, None)
+    assert torch.equal(back.selection, state.selection) and back.name == state.name
+
+
 def test_poor_evidence_is_told_and_left_out():
     state = asked("red, blue")
     poor = world().field.scalars.reliability < 0.6

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import torch
 
-from normlift_ns.api import lift_run
 from normlift_ns.core.evidence import Evidence
 from normlift_ns.encoders.cache import _read, _write
 from normlift_ns.errors import InputError
 from normlift_ns.lifted_run import LiftedRun, open_run
+from normlift_ns.pipeline import lift_run
 from tests.io.test_digests import flipped
 
 KEPT = {"regions": "labels", "features": "features", "texts": "text"}

@@ -16,7 +16,7 @@ from normlift_ns import Evidence
 from normlift_ns.analysis.explain import VoteImage, explain_selection
 from normlift_ns.core.evidence import Entries
 from normlift_ns.errors import InputError
-from normlift_ns.query.histograms import relevancy_histogram
+from normlift_ns.query.threshold import relevancy_histogram
 from normlift_ns.session import actions
 from normlift_ns.session.prompts import Prompt, build_query
 from normlift_ns.session.state import State

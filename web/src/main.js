@@ -10,7 +10,7 @@ import { startTooltips, toast } from "./notices.js";
 import { Stills } from "./stills.js";
 import { Tools, TOOLS } from "./tools.js";
 import { View3D } from "./view.js";
-import { showExplanation } from "./why.js";
+import { closeStaleExplanation, showExplanation } from "./why.js";
 
 /** @type {[string, string, string][]} Color mode, label and tooltip. */
 const MODES = [
@@ -386,6 +386,7 @@ class Page {
     this.state = state;
     this.search.show(state);
     this.panel.show(state);
+    closeStaleExplanation(state);
     for (const [mode] of MODES) $(`mode-${mode}`).setAttribute("aria-checked", String(mode === state.color_mode));
     this.scene?.setOutline(OUTLINED.includes(state.color_mode) && state.selected > 0);
     this.showLegend(state);
@@ -411,7 +412,7 @@ class Page {
     if (probe) {
       this.probes.delete(seq);
       probe(position);
-      if (!position) toast("There is no object at this position. Click an object.", {});
+      if (!position) toast("This position has no object. Click an object.", {});
       return;
     }
     if (seq !== this.pointed || !this.pointer) return;
@@ -478,7 +479,7 @@ class Page {
   async screenshot(anchor) {
     const name = `${this.run.name}.png`.replace(/[^\w.-]+/g, "_");
     const blob = this.scene ? await this.scene.screenshot() : await this.stills.blob();
-    if (!blob) return toast("There is no image yet. Try again in a moment.", { kind: "error", anchor });
+    if (!blob) return toast("The page has no image yet. Try again in a moment.", { kind: "error", anchor });
     saveBlob(blob, name);
     toast(`Downloaded ${name}`, { kind: "done", anchor });
   }

@@ -121,7 +121,11 @@ export class Search {
     const several = texts.length > 1;
     const tip =
       `${grouped(one.count ?? 0)} Gaussians, best relevancy ${fixed(Math.min(1, one.relevancy ?? 0))}.` +
-      (several ? (shown ? " Click to show all answers." : " Click to show only this answer.") : "");
+      (shown && !state.by_hand
+        ? " Click to show all answers."
+        : several || state.by_hand
+          ? ` Click to show ${several ? "only this" : "the"} answer.`
+          : "");
     const dim = state.by_hand || (state.shown !== null && !shown && several);
     return h(
       "li",
@@ -134,7 +138,12 @@ export class Search {
           "data-tip": tip,
           "data-key": `chip-${one.text}`,
           onclick: (/** @type {Event} */ event) =>
-            several && this.act("show_prompt", shown ? null : index, /** @type {Element} */ (event.currentTarget)),
+            (several || state.by_hand) &&
+            this.act(
+              "show_prompt",
+              several && (!shown || state.by_hand) ? index : null,
+              /** @type {Element} */ (event.currentTarget),
+            ),
         },
         h("span.swatch", { style: `background: ${cssColor(one.color ?? [0.5, 0.5, 0.5])}` }),
         h("span", {}, one.text),

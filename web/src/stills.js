@@ -17,7 +17,7 @@ export class Stills {
     this.send = send;
     this.place = place;
     this.whenShown = shown;
-    /** True to request large images too, if there is no other renderer. */
+    /** True to request large images too, without another renderer. */
     this.fine = false;
     this.background = [0, 0, 0];
     this.waiting = false;

@@ -16,7 +16,7 @@ export function showExplanation(message, closed) {
     h(
       "div.row.spread",
       {},
-      h("p", {}, h("b", {}, "Why? "), message.text, message.problem ? h("span.warn", {}, ` ${message.problem}`) : ""),
+      h("p", {}, h("b", {}, message.name === "selection" ? "Why? " : `Why ${message.name}? `), message.text, message.problem ? h("span.warn", {}, ` ${message.problem}`) : ""),
       button("Close", "clear", "Close", "Escape", close, { bare: true }),
     ),
     h(
@@ -24,12 +24,19 @@ export function showExplanation(message, closed) {
       {},
       ...[
         group("Strongest support", message.support ?? [], "agreement"),
-        group("Most disagreement", message.disagreement ?? [], "disagreement"),
+        group("Images that disagree", message.disagreement ?? [], "disagreement"),
       ].filter(Boolean),
     ),
   );
+  $("why").dataset.selected = message.selected;
   $("why").hidden = false;
   closed();
+}
+
+/** Close the panel if it explains another selection. @param {any} state */
+export function closeStaleExplanation(state) {
+  const panel = $("why");
+  if (!panel.hidden && panel.dataset.selected !== String(state.selected)) panel.querySelector("button")?.click();
 }
 
 /** @param {any} entry @param {string} of */

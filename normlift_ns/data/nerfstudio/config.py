@@ -157,7 +157,7 @@ class RunLocation:
     data: Path
     """Path of the dataset, a folder or a .json file."""
     data_moved: bool
-    """True if `data` differs from the path in the config relative to `root`."""
+    """False if `data` was found at the path in the config, relative to `root`; otherwise True."""
 
     @property
     def folder(self) -> Path:
@@ -408,7 +408,7 @@ _RANGES: dict[str, tuple[Callable[[Any], bool], str]] = {
 """Checks and descriptions of the ranges of numbers that affect a lift. Some data parsers do not have all of these
 numbers."""
 _MAX_DEPTH, _MAX_INT = 12, 2**53
-_REMEDY = "Restore the config.yml that ns-train wrote."
+_REMEDY = "Restore the original config.yml of the run."
 _TRAINING_ONLY = re.compile(
     r"(machine|logging|viewer)\..*|pipeline\.datamanager\.(cache_images|cache_images_type|train_cameras_sampling_strategy)"
 )
@@ -606,7 +606,7 @@ def check_lift_options(options: LiftOptions, name: str) -> None:
         RefineConfig(**vars(options.vote))
         LiftOptions(**vars(options))
     except ValueError as error:
-        raise InputError(f"{name}: {error}. {_REMEDY}") from error
+        raise InputError(f"{name}: {error}") from error
 
 
 SUPPORTED_METHODS = (

@@ -406,8 +406,8 @@ def _check_transforms(meta: TransformsEntries, path: Path, parser: config_classe
     positions = {tuple(row[3] for row in frame.transform_matrix[:3]) for frame in meta.frames}
     if len(positions) == 1 and parser.auto_scale_poses and parser.center_method == "poses":
         raise InputError(
-            f"{path}: all {len(meta.frames)} cameras have the same position, so nerfstudio cannot scale them. Expected "
-            "the cameras of the training."
+            f"{path}: all cameras have the same position (number of cameras: {len(meta.frames)}), so nerfstudio cannot "
+            "scale them. Expected the cameras of the training."
         )
     _check_files([path.parent / frame.file_path for frame in meta.frames], path)
     count, masked = len(meta.frames), sum(frame.mask_path is not None for frame in meta.frames)

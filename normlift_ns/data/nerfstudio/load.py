@@ -210,7 +210,7 @@ class NerfstudioScene:
 def load_nerfstudio_scene(
     load_config: Path, *, data: Path | None = None, load_step: int | None = None
 ) -> NerfstudioScene:
-    """Load a run of stock splatfacto, splatfacto-big or normlift, from any working directory.
+    """Load a run of one of `SUPPORTED_METHODS`, from any working directory.
 
     The function reads the config, the checkpoint, the cameras of the dataset and the image headers. Views read their
     images when they are accessed.
@@ -249,8 +249,8 @@ def load_nerfstudio_scene(
     missing = [file for file in files if not file.is_file()]
     if missing:  # report missing files before a long lift
         raise FileNotFoundError(
-            f"{len(missing)} of {len(files)} image files of the dataset {location.data} are missing; the first is "
-            f"{missing[0]}. Copy them to these paths{advice}."
+            f"Image files of the dataset {location.data} are missing ({len(missing)} of {len(files)}, the first is "
+            f"{missing[0]}). Copy them to these paths{advice}."
         )
     remarks = _check_transform(dataset.transform, dataset.scale, location, advice)
     poses = _training_poses(dataset.train, model, checkpoint, advice)
@@ -296,7 +296,7 @@ def _check_transform(
         raise InputError(
             f"The dataset {location.data} has changed since the training of {location.run_dir}: frames were added, "
             f"removed or moved. Its poses give scale {scale:.6g}, but {file.name} has {trained.scale:.6g}, and world "
-            f"coordinates differ by up to {gap:.3g}. Restore transforms.json{advice}."
+            f"coordinates differ by up to {gap:.3g}. Restore the camera file of the dataset{advice}."
         )
     return ()
 

@@ -1,30 +1,42 @@
-"""Histograms of the relevancies of prompts, with suggested thresholds.
+"""Threshold and verdict for the relevancies of a prompt: their histogram, the threshold that it suggests, and presence.
 
-Let m be the median relevancy of the Gaussians that have a direction. Let t be their top, the relevancy that one
-Gaussian in a thousand exceeds. If more than half of the Gaussians are at the top, m is the minimum instead of the
-median, so that a threshold can still separate them.
-
-The suggested threshold is the one at which the selection is most stable. Let N(x) be the number of Gaussians above x
-and u the relevancy that 20 Gaussians exceed, or one in a thousand if these are fewer. Of the thresholds m + f (u - m)
-with f in the range of the encoder, it is the one for which log N falls least from f - 0.2 to f + 0.2. If this is at
-an end of the range, the selection is stable nowhere, and f is the middle of the range. docs/honest_answers.md has the
-errors of this rule, and those of alternatives.
+This module does not need torch.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
 from normlift_ns.core.arguments import check_arguments
-from normlift_ns.core.relevancy import TOP_QUANTILE
+from normlift_ns.core.relevancy import RELEVANCY_RULES, TOP_QUANTILE
 from normlift_ns.encoders.registry import EncoderKind, find_encoder_kind
+from normlift_ns.options import RelevancyRule
 from normlift_ns.query.text_encoder import HasManifest, encoder_name
+
+Verdict = Literal["found", "weak match", "probably not here"]
+"""Presence of a prompt in a scene. found: the prompt matches better than almost all unrelated words.
+weak match: it matches better than most of them. probably not here: it does not."""
+
+
+# Histogram of the relevancies of one prompt, with a suggested threshold.
+#
+# Let m be the median relevancy of the Gaussians that have a direction. Let t be their top, the relevancy that one
+# Gaussian in a thousand exceeds. If more than half of the Gaussians are at the top, m is the minimum instead of the
+# median, so that a threshold can still separate them.
+#
+# The suggested threshold is the one at which the selection is most stable. Let N(x) be the number of Gaussians above x
+# and u the relevancy that 20 Gaussians exceed, or one in a thousand if these are fewer. Of the thresholds m + f (u - m)
+# with f in the range of the encoder, it is the one for which log N falls least from f - 0.2 to f + 0.2. If this is at
+# an end of the range, the selection is stable nowhere, and f is the middle of the range. docs/honest_answers.md has the
+# errors of this rule, and those of alternatives.
+
 
 HISTOGRAM_BINS = 32
 _AT_TOP = 1e-3
@@ -32,11 +44,11 @@ _AT_TOP = 1e-3
 _EPSILON = 1e-6
 """Smallest width of a histogram, and distance of the suggested threshold below the top if all relevancies are equal."""
 _SMALLEST_OBJECT = 20
-"""Number of Gaussians that exceed u (see the module docstring) if the scene has 20,000 or more."""
+"""Number of Gaussians that exceed u (see above) if the scene has 20,000 or more."""
 _STABLE_OVER = 0.2
-"""Distance below and above f (see the module docstring) over which the fall of log N is measured."""
+"""Distance below and above f (see above) over which the fall of log N is measured."""
 _STEPS = 100
-"""Number of steps from m to u (see the module docstring) at which the Gaussians above a threshold are counted."""
+"""Number of steps from m to u (see above) at which the Gaussians above a threshold are counted."""
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
@@ -46,7 +58,7 @@ class Histogram:
     """Histogram of the relevancies of one prompt in bins of equal width, with thresholds.
 
     >>> import numpy as np
-    >>> from normlift_ns.query.histograms import relevancy_histogram
+    >>> from normlift_ns.query.threshold import relevancy_histogram
     >>> values = np.array([0.1] * 60 + [0.2] * 30 + [0.9] * 10)
     >>> hist = relevancy_histogram(values, np.ones(100, bool), 0.5, (0.4, 0.8))
     >>> int(hist.counts.sum()), 0.2 < hist.suggested < 0.9
@@ -169,7 +181,7 @@ def draw_histogram(
 
 
 def suggested_range(field: HasManifest) -> tuple[float, float]:
-    """Return the lowest and highest f (see the module docstring) of a suggested threshold for the field's encoder."""
+    """Return the lowest and highest f (see above) of a suggested threshold for the field's encoder."""
     kind = find_encoder_kind(encoder_name(field))
     return EncoderKind.suggested if kind is None else kind.suggested
 
@@ -217,3 +229,58 @@ def _suggest(
     stable = steps[fall <= fall.min() + _EPSILON]
     best = stable[len(stable) // 2]
     return float(edges[best if first < best < last else (first + last) // 2])
+
+
+# Presence of prompts in a scene.
+#
+# The rank of a prompt is the fraction of the null vocabulary whose best cosine is lower than that of the prompt. The
+# limits on the rank fix the rate of false positives: with every encoder, one unrelated word in ten is "found". The
+# color encoder has limits on the cosine instead. Without a null vocabulary of at least 100 words, the verdict depends
+# on the relevancy, which compares the prompt with the negatives. docs/honest_answers.md has the counts.
+
+
+_FOUND_RANK, _WEAK_RANK = 0.9, 0.7
+"""Minimum ranks of a prompt (see `null_rank`) for the verdicts "found" and "weak match"."""
+_FEWEST_NULL_WORDS = 100
+"""Minimum number of unrelated words (null words) for a meaningful `null_rank`."""
+
+
+def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
+    """Return the rank of a prompt, in 0..1; None if the field has too few null words.
+
+    The rank is the fraction of unrelated words (null words) whose top cosine is below `top_cosine`.
+    """
+    tops = (manifest.get("null_words") or {}).get("tops", ())
+    return bisect_left(tops, top_cosine) / len(tops) if len(tops) >= _FEWEST_NULL_WORDS else None
+
+
+def compares_cosines(manifest: Mapping[str, Any], encoder: str | None) -> bool:
+    """Return whether `judge` uses cosines (with limits of the encoder or null words) instead of relevancies."""
+    kind = find_encoder_kind(encoder)
+    return (kind is not None and kind.present_from is not None) or null_rank(manifest, 0.0) is not None
+
+
+def judge(
+    manifest: Mapping[str, Any], encoder: str | None, rule: RelevancyRule, *, top_cosine: float, top: float
+) -> Verdict | None:
+    """Return the verdict on a prompt; None without null words, limits or negatives to compare with.
+
+    Args:
+        manifest: Manifest of the field.
+        encoder: Name of the encoder of the field.
+        rule: Relevancy rule of the query.
+        top_cosine: Cosine that one Gaussian in a thousand exceeds.
+        top: Relevancy that one Gaussian in a thousand exceeds.
+    """
+    kind, rank = find_encoder_kind(encoder), null_rank(manifest, top_cosine)
+    if kind is not None and kind.present_from is not None:
+        return _by_limits(top_cosine, kind.present_from)
+    if rank is not None:
+        return _by_limits(rank, (_WEAK_RANK, _FOUND_RANK))
+    settings = RELEVANCY_RULES[rule]
+    return None if settings.presence_limit is None else _by_limits(top, (settings.threshold, settings.presence_limit))
+
+
+def _by_limits(value: float, limits: tuple[float, float]) -> Verdict:
+    weak, found = limits
+    return "found" if value >= found else "weak match" if value >= weak else "probably not here"

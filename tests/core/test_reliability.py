@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from normlift_ns.core.independence import independent_views, pair_reliability
+from normlift_ns.core.reliability import independent_views, pair_reliability
 from normlift_ns.core.sparse import SparseRows
 from tests.random_scenes import dense, generator, random_evidence
 
