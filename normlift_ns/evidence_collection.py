@@ -364,7 +364,7 @@ def evidence_keys(gaussians: GaussianScene, block: ViewBatch, config: RasterConf
 
 
 def cells_to_regions(evidence: Evidence, block: ViewBatch) -> Evidence:
-    """Convert evidence of a block's cells to evidence of its regions."""
+    """Convert evidence of the cells of a batch of views to evidence of its regions."""
     counts = torch.tensor([0, *(len(rows) for rows in block.features)])
     first = counts.cumsum(0).tolist()
     columns = [torch.where(regions >= 0, regions + start, -1) for regions, start in zip(block.regions, first)]

@@ -507,12 +507,12 @@ class SourceOptions:
     regions: str = "auto"
     """Image regions, each of which gets one feature. sam: masks of SAM. sam3: masks of SAM 3 for text prompts; see
     --sam3-prompts. edges: regions bounded by edges from a small network; fetch its weights with ns-normlift-weights
-    --get edges. patches: patches of a vision transformer. superpixel: SLIC superpixels. grid: squares. files: label
-    maps from --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise, auto selects
-    superpixel for the encoder color. For a neural network, it selects the first of sam, edges and patches that this
-    machine and the network support, or else superpixel. On a CPU, it skips sam. It also skips edges there if the
-    network supports patches but would encode each region as a crop. Any other name: a mask source from an installed
-    plugin."""
+    --get edges. patches: patches of a vision transformer. superpixel: pixels of similar color and position. grid:
+    squares. files: label maps from --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise,
+    auto selects superpixel for the encoder color. For a neural network on a GPU, it selects the first of sam, edges and
+    patches that this machine and the network support, or else superpixel. On a CPU, it does the same without sam, and
+    patches come before edges if the network encodes each region as a crop, as CLIP does. Any other name: a mask source
+    from an installed plugin."""
     sam3_prompts: tuple[str, ...] = ()
     """Prompts for the masks of --regions sam3. If there are none, SAM 3 uses the prompts of --queries."""
     region_count: int | None = None
@@ -592,8 +592,8 @@ class SplatOptions:
     transform except that of --gsplat-normalize."""
     gsplat_normalize: bool = True
     """For a splat from gsplat's trainer: assume that the trainer normalized the world, unless its cfg.yml says
-    otherwise, and recompute this transform from the COLMAP project. For other splats, --world-transform auto also tries
-    this transform."""
+    otherwise, and recompute the normalization from the COLMAP project. For other splats, --world-transform auto also
+    tries this normalization."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None
@@ -664,8 +664,8 @@ class RefineConfig(CheckedOptions):
     median distance from a Gaussian to the nearest one at another position. None: 2 for posterior, 1 for paper."""
     tau: float | None = None
     """Cosine at which the agreement of two directions is one half, in -1..1. Larger values require more similar
-    directions. None: 0.95 for paper. For posterior, a lift measures tau on neighbors that share regions if the
-    consensus changed features and there are at least 50 such pairs, and otherwise uses 0.9."""
+    directions. None: 0.95 for paper. For posterior, a lift measures tau on pairs of neighbors that share a region. It
+    uses 0.9 instead if there are fewer than 50 pairs or the consensus changed no features."""
     gamma: float | None = None
     """Softness of the agreement around the cosine --vote-tau, > 0. Larger values blur the distinction between similar
     and different directions. None: 0.4 for paper. For posterior, (1 - tau) / 2 if tau is measured, else 0.05."""

@@ -443,14 +443,15 @@ def lift_collection(
         field = SemanticField.build(
             lifted, means, copied, tolerance=options.tolerance, storage=options.storage, provenance=provenance
         )
-        field = add_null_level(field, source, encoder)
+        field = add_null_level(field, collection, encoder)
         step()
     return LiftResult(with_cost(field, stages, device), stages.seconds)
 
 
-def add_null_level(field: SemanticField, source: FeatureSource, encoder: Mapping[str, Any]) -> SemanticField:
+def add_null_level(field: SemanticField, collection: EvidenceCollection, encoder: Mapping[str, Any]) -> SemanticField:
     """Add the null level of the encoder's null vocabulary to a field; return the field unchanged if there is none."""
-    vectors = null_vectors(source, encoder)
+    reused = collection.cache / "null_words" if collection.options.reuse_evidence else None
+    vectors = null_vectors(collection.source, encoder, reused)
     return field if vectors is None else with_null_level(field, vectors)
 
 

@@ -105,7 +105,7 @@ class Measurements:
     cached_evidence_share: float
     """Share of the views with cached evidence, in 0..1."""
     core_s: Mapping[str, Rate]
-    """Cost in seconds of the enabled stages: consensus, lift, neighbors, vote and store."""
+    """Cost of each enabled stage in seconds, by name: consensus, recognition, lift, neighbors, vote, store."""
     field_bytes: Rate
     """Bytes of the stored semantics."""
     run_bytes: int
@@ -168,7 +168,7 @@ class Plan:
 def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
     """Estimate the cost of a lift.
 
-    The devices share the work on views and Gaussians, but not the preparation, the loading of networks and the writing.
+    The devices share the work on views and Gaussians, but not the preparation, the loading of networks or the writing.
 
     Args:
         num_devices: Number of processes that share the work, each with its own device; at least 1.

@@ -10,10 +10,11 @@ caches of kernels and bytecode, first ones with those filled (median of 3; pip l
 ones with every stage cached (median of 3). The error of a new text is that of its vector against open_clip in float64.
 What the file holds of the other kind of machine stays.
 
-With --before: lifts by colors with empty caches of kernels and bytecode (once), with those filled (cache of features
-empty), with every stage cached, and on two cores without the GPU; --render-dir with one prompt and three views, and
-with five prompts and all views; a thousand names of colors, vectors given, in a warm process on the GPU, and on two
-cores. --quick leaves out the slowest cases of the other checkout.
+With --before: lifts by colors with empty caches of kernels and bytecode, with those filled (cache of features empty),
+with every stage cached, and, if numba is installed, on two cores without the GPU; --render-dir with one prompt and
+three views, and with five prompts and all views; a thousand names of colors, vectors given, in a warm process on the
+GPU, and on two cores; if their weights are here, edges with ImageNet's classifier. --quick measures the other checkout
+once, and leaves out its slowest cases.
 """
 
 from __future__ import annotations
@@ -21,17 +22,20 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from normlift_ns.encoders.weights import EDGES
 from normlift_ns.io.arrays import load_arrays
 from research.overhead import HERE, run, spread
 from research.report import RESULTS, Metric, Report, hardware
@@ -190,7 +194,9 @@ def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: 
     checkouts = {"now": HERE, "before": before}
     folders = {name: folder / name for name in checkouts}
     data = trained.parents[4] / trained.parents[2].name
-    source, repeats = ("--data", data, "--encoder", "color"), 1 if quick else 3
+    colors = ("--encoder", "color")
+    repeats = {"now": 3, "before": 1 if quick else 3}
+    gpu, on_cpu = torch.cuda.is_available(), find_spec("numba") is not None
     found: dict[str, list[float]] = {}
 
     def note(name: str, seconds: float) -> None:
@@ -198,9 +204,11 @@ def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: 
         print(name, f"{seconds:.2f}", flush=True)
 
     def lift(name: str, case: str, output: str, *flags: object, program: str = LIFT) -> Path:
-        given = (*source, "--timestamp", "run", "--overwrite", True, *flags)
+        given = ("--data", data, "--timestamp", "run", "--overwrite", True, *flags)
         taken = lifted(trained, folders[name], output, *given, checkout=checkouts[name], program=program)
         note(f"{name}.{case}_lift_s", taken["wall"])
+        for stage, seconds in taken.items():
+            found.setdefault(f"{name}.{case}_lift.{stage}_s", []).append(seconds)
         return next((folders[name] / output).glob("*/normlift/run/config.yml"))
 
     def pictures(name: str, case: str, config: Path, *flags: object) -> None:
@@ -214,28 +222,36 @@ def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: 
         for key, value in json.loads(file.read_text()).items():
             note(f"{name}.{key}_{device}", value)
 
-    gpu, configs = torch.cuda.is_available(), {}
-    for name in ("before", "now"):
-        configs[name] = lift(name, "cold", "cold")
-    for turn in range(repeats if gpu else 0):
-        for name in checkouts:
-            lift(name, "later", f"later{turn}")
-            lift(name, "cached", "cold")
+    def turns() -> Iterator[tuple[str, int]]:
+        return ((name, turn) for turn in range(3) for name in checkouts if turn < repeats[name])
+
+    configs = {}
+    for name, turn in turns():
+        shutil.rmtree(folders[name] / "kernels", ignore_errors=True)
+        configs[name] = lift(name, "cold", f"cold{turn}", *colors)
+    for name, turn in turns() if gpu else ():
+        lift(name, "later", f"later{turn}", *colors)
+        lift(name, "cached", "cold0", *colors)
+    for name in checkouts:
+        pictures(name, "first_pictures", configs[name], "--text", "red")
+    for name, _ in turns():
+        pictures(name, "pictures_3_views", configs[name], "--text", "red")
     for name in checkouts:
         views = json.loads((configs[name].parent / "normlift" / "manifest.json").read_text())["views_lifted"]
         all_views = ("--render-views", *(Path(view).stem for view in views))
-        for turn in range(repeats + 1):
-            pictures(name, "pictures_3_views" if turn > 0 else "first_pictures", configs[name], "--text", "red")
-        if name == "now" or not quick:
+        for _ in range(2 if name == "now" else int(not quick)):
             pictures(name, "pictures_45_views", configs[name], "--text", *FIVE, *all_views)
     slow = ("now",) if quick else ("now", "before")
     for name in slow if gpu else ():
         prompts(name, "cuda", configs[name])
-    if gpu:  # two cores of this machine; without a GPU, the lifts above are those
+    if EDGES.is_here:
+        for turn in range(repeats["now"] if gpu else 1):
+            lift("now", "edges", f"edges{turn}", "--regions", "edges", "--encoder", "imagenet")
+    if gpu and on_cpu:  # two cores of this machine; without a GPU, the lifts above are those
         for name in checkouts:
-            lift(name, "first_cpu", "some", "--device", "cpu", "--max-views", 2, program=TWO_CORES + LIFT)
-            lift(name, "cpu", "cpu", "--device", "cpu", program=TWO_CORES + LIFT)
-    for name in slow:
+            lift(name, "first_cpu", "some", *colors, "--device", "cpu", "--max-views", 2, program=TWO_CORES + LIFT)
+            lift(name, "cpu", "cpu", *colors, "--device", "cpu", program=TWO_CORES + LIFT)
+    for name in slow if on_cpu else ():
         prompts(name, "cpu", configs[name])
     for name, values in found.items():
         report.add(

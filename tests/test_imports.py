@@ -51,7 +51,7 @@ FOREIGN = {
     "core": BASE,
     "rasterization": TENSORS | {"numpy", "numba", "gsplat", "typing_extensions"},
     "encoders": BASE | {"xxhash", "open_clip", "PIL", "huggingface_hub", "torchvision", "skimage"},
-    "segmentation": BASE | {"skimage", "PIL", "huggingface_hub", "torchvision", "h5py"},
+    "segmentation": BASE | {"skimage", "PIL", "cv2", "huggingface_hub", "torchvision", "h5py"},
     "data": BASE | {"msgspec", "zstandard", "cv2", "PIL", "plyfile", "yaml", "nerfstudio", "typing_extensions"},
     "distributed": TENSORS,
     "evidence_collection": TENSORS | {"xxhash"},

@@ -403,7 +403,7 @@ class RecordedVotes:
 
     @property
     def disagreement(self) -> float:
-        """Usual disagreement of the views about a Gaussian, 1 minus the median norm of the mean features.
+        """Typical disagreement of the views about a Gaussian, 1 minus the median norm of the mean features.
 
         It is the mean of the values before and after the consensus, or the value after the consensus if the value
         before it is unknown.

@@ -520,7 +520,8 @@ class NormLiftBatch(CheckedOptions):
     """Folder for results, logs and claims, which all workers share. None: <name of the list>_batch next to the list."""
     shard: str = "auto"
     """Part of the list that this worker lifts. i/n: the i-th of n parts. none: all captures that no other worker has
-    claimed. auto: the part that SLURM_ARRAY_TASK_ID, RANK and WORLD_SIZE define, if they are set, else none."""
+    claimed. auto: the part that the variables of a SLURM job array, or RANK and WORLD_SIZE,
+    define; without them, none."""
     patience: float = 120.0
     """Take over another worker's capture after this many seconds without a heartbeat, in 1..86400. Use the same value
     for all workers. Larger values tolerate longer pauses but delay the takeover."""

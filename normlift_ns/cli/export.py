@@ -56,8 +56,8 @@ class NormLiftExport(options.CheckedOptions):
     """Folder for a PNG mask of each training image, with 255 for pixels of selected Gaussians, else 0. --select rest
     swaps the values. The masks fit the undistorted images that the scene was trained with."""
     arrays_dir: Path | None = None
-    """Folder for the exported Gaussians as arrays: coord.npy, segment.npy, instance.npy (with -1 for ignored Gaussians)
-    and names.json."""
+    """Folder for the exported Gaussians as arrays: coord.npy, segment.npy, instance.npy and names.json. Classes and
+    objects are numbered from 0; -1 marks Gaussians without a class or an object."""
     exporters: tuple[str, ...] = ()
     """Further outputs: ply, compressed_ply, glb, spz (version 3), spz4 (version 4), or exporters of other packages.
     Each exporter writes <name>_<exporter> with its own suffix to the output folder."""
@@ -152,7 +152,7 @@ class NormLiftExport(options.CheckedOptions):
         name = self.output_filename
         if name in ("", "..") or Path(name).name != name:
             raise InputError(
-                f"--output-filename {name!r} is not a file name; give a name without folders, such as splat.ply"
+                f"--output-filename {name!r} is not a valid file name; give a name without folders, such as splat.ply"
             )
         target = self.output_dir / name
         cloud = None if self.transfer is None else self.output_dir / f"{self.transfer.stem}_labels.ply"

@@ -77,10 +77,11 @@ class NormLift(CheckedOptions):
     --transforms with --gsplat-normalize False or a file in --world-transform."""
     splat: SplatOptions = field(default_factory=SplatOptions)
     add_images: Path | None = None
-    """COLMAP project folder or transforms.json with images taken after training, which the lift then uses too. To align
-    them, it must also contain two or more images of the scene, whose cameras have not moved relative to each other."""
+    """COLMAP project folder or transforms.json with images taken after training, which the lift then uses too. It must
+    also contain two or more images of the original dataset under their original names, to align the new images. The
+    cameras of these must have the same relative poses as in training."""
     check_alignment: bool = True
-    """Compare three training images with renders of the scene before the lift. False: skip the comparison."""
+    """Compare up to three training images with renders of the scene before the lift. False: skip the comparison."""
     dry_run: bool = False
     """Estimate the time of every stage, the memory, the disk space and the number of cached views, without lifting. The
     command measures its speed on a few images."""
@@ -93,7 +94,7 @@ class NormLift(CheckedOptions):
     timestamp: str | None = None
     """Name of the new run directory. None: the current time."""
     overwrite: bool = False
-    """Replace an existing run directory of that name, and exported files whose content differs."""
+    """Replace an existing run directory with the same time stamp, and exported files whose content differs."""
     device: str = "auto"
     """Device to lift on: auto, cpu or cuda."""
     num_devices: int = 1

@@ -139,7 +139,7 @@ def check_run_config(config: Path, data: Path | None, step: int | None = None, *
     if checkpoints.is_dir() and not any(checkpoints.glob(pattern)):
         files = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
         raise FileNotFoundError(
-            f"The checkpoint {pattern} is not in {checkpoints}, which contains {files}. Copy it to this folder"
+            f"A checkpoint {pattern} is missing in {checkpoints}, which contains {files}. Copy it to this folder"
             f"{'' if step is None else ', or leave out --load-step to use the last checkpoint'}."
         )
 

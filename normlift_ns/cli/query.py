@@ -109,7 +109,7 @@ class NormLiftQuery(CheckedOptions):
     box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z. Both span the
     1st to 99th percentile. R is the mean reliability. views counts the training images that show the object with at
     least a tenth of its largest visible area. best views names up to three of them: those with the whole object first,
-    and larger views before smaller ones. If there are more than 40 objects, the table lists only the 10 largest, and a
+    and views that show more of it before others. If there are more than 40 objects, the table lists only the 10 largest, and a
     line below counts the objects of each prompt."""
     objects_dir: Path | None = None
     """Folder for the list of --objects or --inventory in capture and scene coordinates, with the axes of the boxes. The
@@ -119,7 +119,7 @@ class NormLiftQuery(CheckedOptions):
     """Length of one capture unit in meters for --objects or --inventory, > 0. If given, the table of objects is in
     meters, in the coordinates of the capture."""
     inventory: bool = False
-    """List at most 20 objects of the scene without prompts, by decreasing evidence, with the columns of --objects. An
+    """Without prompts, list at most 20 objects of the scene, by decreasing evidence, with the columns of --objects. An
     object is named after a word of the vocabulary that clearly matches it. Others get a number, such as object 3."""
     vocabulary: Path | None = None
     """Text file with names of objects for --inventory, one per line. None: the texts of the run's file of text

@@ -23,7 +23,9 @@ _BLOCK = 32
 
 
 def with_null_level(field: SemanticField, vectors: Float[Tensor, "m d"]) -> SemanticField:
-    """Return a field with null levels, and with the top cosine of every null text in its manifest.
+    """Return the field with null levels.
+
+    Its manifest records the top cosine of each null text, which is the 99.9 % quantile over the Gaussians.
 
     Args:
         vectors: Vectors of any norm > 0, one for each of at least two texts of the null vocabulary.

@@ -180,7 +180,7 @@ def _check_numbers(entry: CameraEntry, source: str) -> None:
     parameters = [(f"distortion_params[{i}]", value) for i, value in enumerate(entry.distortion_params or ())]
     for name, value in (*_given(entry, "cx", "cy", *DISTORTION), *parameters):
         if not abs(value) < _MAX_VALUE:
-            raise InputError(f"{source}: {name} is {value:g}, expected a finite number below 1e30.")
+            raise InputError(f"{source}: {name} is {value:g}, expected a number between -1e30 and 1e30.")
 
 
 def _given(entry: CameraEntry, *names: str) -> list[tuple[str, float]]:

@@ -94,7 +94,7 @@ def run_lift_distributed(team: TorchCommunicator, request: pipeline.LiftRequest)
         step()
     if field is None:
         return None
-    field = pipeline.add_null_level(field, collection.source, prepared.encoder)
+    field = pipeline.add_null_level(field, collection, prepared.encoder)
     result = pipeline.LiftResult(pipeline.with_cost(field, stages, device), stages.seconds)
     return pipeline.write_lifted_run(prepared, result, before)
 

@@ -35,7 +35,9 @@ def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
             f"--features-dir {options.features_dir} has no effect without --features langsplat; add that flag"
         )
     if (file := options.text_embeddings) is not None:
-        raise InputError(f"--text-embeddings {file} has no effect without imported features; add --features langsplat")
+        raise InputError(
+            f"--text-embeddings {file} has no effect without precomputed features; add --features langsplat"
+        )
     options = resolve_source(options, device)
     name = options.regions
     masks = _make_masks(options, name, device)

@@ -120,8 +120,12 @@ def _unique_lab(image: UInt8[np.ndarray, "h w 3"]) -> tuple[Float64[np.ndarray, 
     from skimage.color import rgb2lab  # noqa: PLC0415 (other encoders do not need it)
 
     red, green, blue = image.reshape(-1, 3).T.astype(np.int32)
-    codes, number = np.unique(red << 16 | green << 8 | blue, return_inverse=True)
-    return rgb2lab(np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1).astype(np.uint8)), number
+    code = red << 16 | green << 8 | blue
+    present = np.zeros(2**24, bool)  # a table of all colors is faster than a sort
+    present[code] = True
+    codes, row_of = np.flatnonzero(present), np.empty(2**24, np.int32)
+    row_of[codes] = np.arange(len(codes))
+    return rgb2lab(np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1).astype(np.uint8)), row_of[code]
 
 
 @cache

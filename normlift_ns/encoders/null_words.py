@@ -17,7 +17,7 @@ from torch import Tensor
 
 from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures
 from normlift_ns.encoders.registry import find_encoder_kind
-from normlift_ns.encoders.text_files import TextEmbeddingFile
+from normlift_ns.encoders.text_files import CachedTextEncoder, TextEmbeddingFile, TextEncoder
 from normlift_ns.errors import InputError
 
 _FEWEST = 5
@@ -30,7 +30,9 @@ def null_words() -> tuple[str, ...]:
     return tuple(json.loads(Path(__file__).with_name("null_words.json").read_text(encoding="utf8")))
 
 
-def null_vectors(source: FeatureSource, encoder: Mapping[str, Any]) -> Float[Tensor, "m d"] | None:
+def null_vectors(
+    source: FeatureSource, encoder: Mapping[str, Any], cache: Path | None = None
+) -> Float[Tensor, "m d"] | None:
     """Return the vectors of the null vocabulary of a lift.
 
     The vocabulary consists of the prompts that were supplied with precomputed features or in a file of text embeddings.
@@ -39,17 +41,22 @@ def null_vectors(source: FeatureSource, encoder: Mapping[str, Any]) -> Float[Ten
 
     Args:
         encoder: Encoder settings from the manifest.
+        cache: Folder that keeps the vectors of `null_words`, because loading a network for them takes seconds. None:
+            compute them.
     """
     kind, file = find_encoder_kind(encoder.get("encoder")), encoder.get("text_vectors")
+    texts: TextEncoder = source
     if isinstance(source, PrecomputedFeatures):
         words: tuple[str, ...] = tuple(source.texts)
     elif file is not None:
         words = tuple(TextEmbeddingFile(Path(file)).texts)
     else:
         words = null_words() if kind is not None and kind.has_null_words else ()
+        identity = {"source": source.identity, "encoder": dict(encoder)}
+        texts = CachedTextEncoder(lambda: identity, lambda: source, cache)
     if len(words) < _FEWEST:
         return None
     try:
-        return source.text(words)
+        return texts.text(words)
     except InputError:  # the encoder cannot embed these words
         return None

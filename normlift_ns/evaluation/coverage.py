@@ -146,7 +146,7 @@ class WeakRegion:
     reliability: float
     """Mean of R_j(S), the expected reliability with the lifted views, in 0..1.
 
-    Views that hardly show a Gaussian have little influence on it.
+    A view that hardly shows a Gaussian has little influence on its R_j(S).
     """
     lifted_reliability: float
     """Mean of the reliability R of the lift, in 0..1. R counts all views in which a Gaussian has weight."""

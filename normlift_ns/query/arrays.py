@@ -16,7 +16,6 @@ from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
-from scipy.sparse import csr_array
 
 from normlift_ns.core.relevancy import PROMPT_BLOCK
 from normlift_ns.encoders.text_files import LazyTextEncoder
@@ -88,6 +87,8 @@ class ArrayField(FieldArrays):
 
     def _evidence_products(self, vectors: Float[np.ndarray, "q d"]) -> Callable[[slice], Float32[np.ndarray, "b m"]]:
         """Return a function that computes the cosines of all directions to a slice of the vectors."""
+        from scipy.sparse import csr_array  # noqa: PLC0415 (takes 0.3 s; most fields store directions)
+
         arrays, rows = self.arrays, cast(Any, self.evidence).rows
         valid = arrays["norm"] > 0
         table = arrays["features"].astype(np.float64) @ vectors.T

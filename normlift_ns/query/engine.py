@@ -148,9 +148,28 @@ class Answer:
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return the numbers of every prompt as plain Python types."""
+        on_gpu = not isinstance(self.relevancy, np.ndarray) and self.relevancy.is_cuda
+        if on_gpu and len(self) >= _THREADS and bool(self.valid.any()):
+            return self._summarize()
         answer = self if len(self) < _THREADS else self._as_numpy()
         with ThreadPoolExecutor(_THREADS) as pool:  # sorting, which takes most of the time, is threaded
             return list(pool.map(Finding.to_json, answer))
+
+    def _summarize(self) -> list[dict[str, Any]]:
+        """Return the result of `to_json`, computed for all prompts at once."""
+        from normlift_ns.query.summaries import summarize  # noqa: PLC0415 (needs torch)
+
+        scalars, positions = self.field.scalars, suggested_range(self.field)
+        summaries = summarize(
+            self.relevancy, self.selected, self.valid, self.means, scalars.reliability, scalars.weight,
+            threshold=self.question.threshold, positions=positions,
+        )  # fmt: skip
+        rows = []
+        for finding, verdict, summary in zip(self, self.verdicts, summaries):
+            some = summary["fraction"] > 0
+            shown = "weak match" if verdict == "probably not here" and some else verdict
+            rows.append({"text": finding.text, "verdict": shown, "read_as": finding.read_as, **summary})
+        return rows
 
     def _as_numpy(self) -> Answer:
         """Return the answer with its arrays on the CPU. Each array is copied once for all prompts."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -96,15 +96,69 @@ def relevancy_histogram(
         positions: Result of `suggested_range`.
     """
     values = _ascending(relevancy[valid])
-    if len(values) == 0:
-        return None
-    low, high = min(float(values[0]), threshold), max(float(values[-1]), threshold)
-    if high - low < _EPSILON:
-        low, high = low - _EPSILON / 2, high + _EPSILON / 2
-    edges = np.linspace(low, high, HISTOGRAM_BINS + 1)
-    counts = np.diff(np.searchsorted(values, edges[1:-1]), prepend=0, append=len(values))
-    median, top = _median_and_top(values)
-    return Histogram(edges, counts.astype(np.int64), threshold, median, top, _suggest(values, median, top, positions))
+    return _histogram(values, threshold, positions) if len(values) > 0 else None
+
+
+def _histogram(values: Float64[np.ndarray, " n"], threshold: float, positions: tuple[float, float]) -> Histogram:
+    """Return the histogram of relevancies in ascending order; see `relevancy_histogram`."""
+
+    def count_below(edges: Float64[np.ndarray, "1 e"]) -> Int64[np.ndarray, "1 e"]:
+        return np.searchsorted(values, edges[0])[None]
+
+    (histogram,) = make_histograms(
+        values[picked_ranks(len(values))][None], count_below, len(values), threshold, positions
+    )
+    return histogram
+
+
+def picked_ranks(count: int) -> list[int]:
+    """Return the ranks, in ascending order of relevancy, of the relevancies that `make_histograms` needs.
+
+    They are the smallest and the largest, u (see the module docstring), and those around the median and around the top.
+    """
+    around = [min(int(share * (count - 1)) + i, count - 1) for share in (0.5, TOP_QUANTILE) for i in (0, 1)]
+    return [0, count - 1, count - 1 - min(_SMALLEST_OBJECT, count // 1000), *around]
+
+
+def make_histograms(
+    picked: Float64[np.ndarray, "q 7"],
+    count_below: Callable[[Float64[np.ndarray, "q e"]], Int64[np.ndarray, "q e"]],
+    count: int,
+    threshold: float,
+    positions: tuple[float, float],
+) -> list[Histogram]:
+    """Return the histogram of each prompt.
+
+    Args:
+        picked: Relevancies of the ranks `picked_ranks(count)`.
+        count_below: Function that returns the number of relevancies of each prompt that are below each edge.
+        count: Number of Gaussians with a direction, at least 1.
+        threshold: Relevancy above which a Gaussian is selected.
+        positions: Result of `suggested_range`.
+    """
+    least, greatest, upper = picked[:, :3].T
+    median, top = (
+        _interpolate(picked[:, i], picked[:, i + 1], share * (count - 1) % 1)
+        for i, share in ((3, 0.5), (5, TOP_QUANTILE))
+    )
+    median = np.where(top - median < _AT_TOP * (top - least), least, median)
+    low, high = np.minimum(least, threshold), np.maximum(greatest, threshold)
+    margin = np.where(high - low < _EPSILON, _EPSILON / 2, 0)
+    edges = np.linspace(low - margin, high + margin, HISTOGRAM_BINS + 1, axis=1)
+    steps = np.linspace(median, upper, _STEPS + 1, axis=1)
+    below = count_below(np.concatenate([edges[:, 1:-1], steps], axis=1))
+    counts = np.diff(below[:, : HISTOGRAM_BINS - 1], prepend=0, append=count).astype(np.int64)
+    suggested = [_suggest(*row, positions) for row in zip(steps, count - below[:, HISTOGRAM_BINS - 1 :], top.tolist())]
+    return [
+        Histogram(*row[:2], threshold, *row[2:]) for row in zip(edges, counts, median.tolist(), top.tolist(), suggested)
+    ]
+
+
+def _interpolate(
+    low: Float64[np.ndarray, " q"], high: Float64[np.ndarray, " q"], share: float
+) -> Float64[np.ndarray, " q"]:
+    """Interpolate linearly, with the same rounding as `np.quantile`."""
+    return low + (high - low) * share if share < 0.5 else high - (high - low) * (1 - share)
 
 
 def _ascending(values: Float[np.ndarray, ...]) -> Float64[np.ndarray, " n"]:
@@ -148,36 +202,34 @@ def suggest_threshold(
     True
     """
     values = _ascending(relevancy[valid])
-    return None if len(values) == 0 else _suggest(values, *_median_and_top(values), positions)
+    return _histogram(values, 0.0, positions).suggested if len(values) > 0 else None
 
 
-def _suggest(values: np.ndarray, median: float, top: float, positions: tuple[float, float]) -> float:
-    """Return the threshold at which the selection is most stable, for M >= 1 relevancies in ascending order."""
+def _suggest(
+    edges: Float64[np.ndarray, " steps"],
+    above: Int64[np.ndarray, " steps"],
+    top: float,
+    positions: tuple[float, float],
+) -> float:
+    """Return the threshold at which the selection is most stable.
+
+    Args:
+        edges: Relevancies from m to u in equal steps.
+        above: Number of Gaussians at or above each edge.
+        top: The top t.
+    """
     if top <= 0:
         return top  # if nothing is relevant, select nothing
-    rank = min(_SMALLEST_OBJECT, len(values) // 1000)
-    upper = float(values[len(values) - 1 - rank])
-    if upper - median < _EPSILON:
-        return upper - _EPSILON
-    edges = np.linspace(median, upper, _STEPS + 1)
-    above = np.log(len(values) - np.searchsorted(values, edges))  # log N at every edge
+    if edges[-1] - edges[0] < _EPSILON:
+        return float(edges[-1]) - _EPSILON
+    logarithm = np.log(above)
     first, last = (round(_STEPS * position) for position in positions)
     reach = round(_STEPS * _STABLE_OVER)
     steps = np.arange(first, last + 1)
-    fall = above[steps - reach] - above[steps + reach]
+    fall = logarithm[steps - reach] - logarithm[steps + reach]
     stable = steps[fall <= fall.min() + _EPSILON]
     best = stable[len(stable) // 2]
     return float(edges[best if first < best < last else (first + last) // 2])
-
-
-def _median_and_top(values: np.ndarray) -> tuple[float, float]:
-    """Return median and top of values in ascending order; if the median is at the top, return the minimum instead of
-    the median.
-    """
-    places = [share * (len(values) - 1) for share in (0.5, TOP_QUANTILE)]
-    median, top = (float(np.quantile(values[int(x) : int(x) + 2], x - int(x))) for x in places)
-    least = float(values[0])
-    return (least if top - median < _AT_TOP * (top - least) else median), top
 
 
 # Presence of prompts in a scene.

@@ -679,7 +679,7 @@ def view_mask(
 
 
 def unique_file_names(images: Sequence[str]) -> list[str]:
-    """Return a unique file name for each image: its stem, or its path in the dataset if several share the stem.
+    """Return a unique file name for each image: its stem, or its path with "_" for "/" if several share the stem.
 
     >>> unique_file_names(["a/0.png", "b/0.png", "b/1.png", "c/2.png", "c/2.jpg"])
     ['a_0', 'b_0', '1', 'c_2.png', 'c_2.jpg']

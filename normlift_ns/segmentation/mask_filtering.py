@@ -166,7 +166,7 @@ def remove_small_regions(masks: Bool[Tensor, "m h w"], least: int) -> tuple[Bool
 
 
 class _Runs(NamedTuple):
-    """Runs of neighboring pixels in a row, in ascending order."""
+    """Runs of neighboring pixels in the rows of a mask, in ascending order."""
 
     start: Int64[Tensor, " n"]
     stop: Int64[Tensor, " n"]

@@ -84,8 +84,6 @@ def gray_bit_depth(path: Path) -> int | None:
 _MAP_SUFFIXES, _MAP_FORMATS = (".png", ".npy"), ("PNG",)
 _MAX_MAP_BYTES = 2**31
 """Largest size of a label map file, in bytes."""
-_COMPACTNESS = 10.0
-"""Weight of spatial distance relative to color distance in superpixels. Larger values produce squarer regions."""
 _WORKERS = min(8, os.cpu_count() or 1)
 """Number of images to segment concurrently. Superpixels need many times the memory of their image."""
 
@@ -105,22 +103,22 @@ class RegionDefaults:
 
 @dataclass(frozen=True)
 class Superpixels(RegionDefaults):
-    """SLIC superpixels on CIELAB color and position, which have similar sizes and follow image edges."""
+    """Superpixels of CIELAB color and position, which have similar sizes and follow image edges."""
 
     count: int = 256
     """Approximate number of superpixels per image, at least 1. An image has at most one per pixel."""
+    device: str = "cpu"
 
     at_once = _WORKERS
 
     @property
     def identity(self) -> dict[str, Any]:
-        return {"kind": "superpixel", "count": self.count, "compactness": _COMPACTNESS}
+        return {"kind": "superpixel", "version": 2, "count": self.count}
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 1 h w"]:
-        from skimage.segmentation import slic  # noqa: PLC0415 (takes 0.5 s; other regions do not need it)
+        from normlift_ns.segmentation.superpixels import superpixels  # noqa: PLC0415 (other regions do not need it)
 
-        segments = slic(image.numpy(), n_segments=self.count, compactness=_COMPACTNESS, start_label=0)
-        return _compact(segments, np.ones(segments.shape, dtype=bool))[None, None]
+        return torch.from_numpy(superpixels(image.to(self.device), self.count))[None, None]
 
 
 @dataclass(frozen=True)

@@ -130,8 +130,8 @@ PATCHES = MaskSource(_make_patches, has_features=True)
 """Patches of the encoder's vision transformer."""
 
 
-SUPERPIXEL = MaskSource(_make("segmentation.regions:Superpixels", lambda o, _: (o.region_count or _COUNT,)))
-"""Superpixels of SLIC."""
+SUPERPIXEL = MaskSource(_make("segmentation.regions:Superpixels", lambda o, device: (o.region_count or _COUNT, device)))
+"""Superpixels of color and position."""
 
 
 GRID = MaskSource(_make("segmentation.regions:Grid", lambda o, _: (o.region_count or _COUNT,)))

@@ -122,7 +122,7 @@ class LayerName(msgspec.Struct, frozen=True):
 
 
 class LayerVisibility(LayerName, frozen=True):
-    """Name of a layer to show or hide."""
+    """Request to show or hide a layer."""
 
     visible: bool
 

@@ -54,7 +54,7 @@ class State:
     prompts: tuple[Prompt, ...] = ()
     """All prompts, including those with errors."""
     query: Query | None = None
-    """Query of the prompts without errors, with the threshold and the minimum reliability."""
+    """Query of the prompts that have no errors, with the threshold and the minimum reliability."""
     shown: int | None = None
     """Index of the only prompt that selects; None if all prompts of the query select."""
     prompts_select: bool = True

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from normlift_ns import InputError, SemanticField
 from normlift_ns.core.null_level import with_null_level
+from normlift_ns.encoders.null_words import null_vectors, null_words
 from normlift_ns.io.field import read_field
 from normlift_ns.query.arrays import ArrayField
 from normlift_ns.query.engine import run_query
@@ -59,3 +63,21 @@ def test_verdicts_follow_ranks_colors_and_leads():
         assert verdicts == ["probably not here", "weak match", "found"]
     colors = [judge({}, "colour", "cosine", top_cosine=value, top=value) for value in (0.5, 0.7, 0.9)]
     assert colors == ["probably not here", "weak match", "found"]
+
+
+def test_the_vectors_of_the_null_words_are_kept_for_later_lifts(tmp_path):
+    asked = []
+
+    def text(words):
+        asked.append(len(words))
+        return torch.nn.functional.normalize(torch.arange(1.0, 2 * len(words) + 1).view(-1, 2), dim=1)
+
+    source: Any = SimpleNamespace(identity={"weights": "a"}, text=text)
+    encoder = {"encoder": "imagenet"}
+    first = null_vectors(source, encoder, tmp_path)
+    again = null_vectors(source, encoder, tmp_path)
+    assert first is not None and again is not None and torch.equal(again, first)
+    assert asked == [len(null_words())]
+    other: Any = SimpleNamespace(identity={"weights": "b"}, text=text)
+    assert null_vectors(other, encoder, tmp_path) is not None
+    assert len(asked) == 2

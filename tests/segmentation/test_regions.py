@@ -3,12 +3,14 @@
 import os
 import struct
 import zlib
+from typing import Any, cast
 
 import numpy as np
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from scipy import ndimage
 
 from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels, read_image
 from tests.encoders.tiny import noise, refused
@@ -46,6 +48,19 @@ def test_superpixels_keep_to_edges_also_of_tiny_images():
             assert labels.shape == size
             assert_compact(labels)
             assert int(labels.min()) == 0
+
+
+def test_superpixels_are_connected_and_of_similar_size_also_in_noise():
+    image = noise(97, 130) // 16
+    image[:, 60:] += 200
+    labels = Superpixels(40).labels(image, "")[0, 0]
+    assert torch.equal(labels, Superpixels(40).labels(image, "")[0, 0])
+    for region in range(int(labels.max()) + 1):
+        _, pieces = cast(tuple[Any, int], ndimage.label(labels == region))
+        assert pieces == 1
+    size = labels.flatten().bincount()
+    assert 30 <= len(size) <= 60
+    assert size.min() >= 0.25 * 97 * 130 / 40
 
 
 MAP = np.array([[0, 7, 7], [3, 0, 200]])
