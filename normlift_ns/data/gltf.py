@@ -151,7 +151,7 @@ def _placed(gltf: _Gltf, mesh: int, file: SplatFile) -> SplatFile:
 
 
 def _world_transform(gltf: _Gltf, mesh: int) -> WorldTransform:
-    """Return the transform from a mesh to its scene; raise InputError if it is no similarity, or with several instances."""
+    """Return the transform from a mesh to its scene; raise InputError for several instances, or if it shears."""
     path, nodes, matrix = gltf.path, gltf.document.nodes, np.eye(4)
     holders = [number for number, node in enumerate(nodes) if node.mesh == mesh]
     if len(holders) > 1 or any(_INSTANCING in nodes[number].extensions for number in holders):

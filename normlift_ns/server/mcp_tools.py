@@ -109,8 +109,8 @@ class Tools:
         return _text(http_api.floaters(self._run(run), {}))
 
     def measure(self, run: Run, start: Coordinates, end: Coordinates) -> str:
-        """Measure the distance between two positions, in scene units and in units of the original capture. The positions
-        are in scene units, as the centers and boxes of list_objects are."""
+        """Measure the distance between two positions, in scene units and in units of the original capture. Give the
+        positions in scene units, as list_objects does."""
         distance = float(np.linalg.norm(np.subtract(start, end)))
         scale = self._run(run).run.to_capture.scale
         return _text({"distance": distance, "distance_in_capture_units": distance * scale})

@@ -153,7 +153,7 @@ def test_images_that_are_missing_or_change_later_are_named(copied: Path) -> None
     with pytest.raises(FileNotFoundError, match=r"003\.jpg"):
         run.train[3]
     run.train.files[7].unlink()
-    with pytest.raises(FileNotFoundError, match=rf"2 of 9 .* {file}.*--data"):
+    with pytest.raises(FileNotFoundError, match=rf"2 of 9, .* {file}.*--data"):
         opened(copied)
     run.train.files[0].unlink()  # which nerfstudio opens to guess the downscaling
     with pytest.raises(FileNotFoundError, match=r"images/000\.jpg"):

@@ -60,7 +60,7 @@ def test_every_level_has_the_same_cells_and_its_own_features(folder):
     assert views[2].features.shape[0] == 0
     for wrong in (None, 3):
         source = RegionFeatures(LabelFiles(folder, level=wrong), ColorEncoder())
-        refused(lambda source=source: source.view(IMAGE, "a.jpg"), "a.npy", "3 levels", "0..2", "--level")
+        refused(lambda source=source: source.view(IMAGE, "a.jpg"), "a.npy", "levels 0..2", "--level")
 
 
 def test_several_levels_at_once(folder):
