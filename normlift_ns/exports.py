@@ -24,8 +24,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.data.compressed_ply import encode_compressed_ply
 from normlift_ns.data.frames import WorldTransform
 from normlift_ns.data.gltf import encode_glb
-from normlift_ns.data.splat import SplatParameters, check_ply_header
-from normlift_ns.data.splat_transforms import transform_splat
+from normlift_ns.data.splat import SplatParameters, check_ply_header, transform_splat
 from normlift_ns.data.spz import decode_spz, encode_spz
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import atomic_file, atomic_files
@@ -372,8 +371,7 @@ def read_cloud(path: Path) -> PlyData:
     names = {} if vertex is None else {item.name: item for item in vertex.properties}
     if vertex is None or not set("xyz") <= set(names) or vertex.count == 0:
         count = 0 if vertex is None else vertex.count
-        noun = "vertex" if count == 1 else "vertices"
-        raise InputError(f"{path} has {count:,} {noun} with {', '.join(names) or 'no properties'}. {expected}")
+        raise InputError(f"{path} has {', '.join(names) or 'no properties'} of {count:,} vertices. {expected}")
     lists = [name for name, item in names.items() if hasattr(item, "len_dtype")]
     if len(lists) > 0:
         raise InputError(f"{path} has vertices with list properties ({', '.join(lists)}); remove these. {expected}")

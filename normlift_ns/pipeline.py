@@ -33,12 +33,11 @@ from normlift_ns.core.consensus import (
 )
 from normlift_ns.core.device import choose_device, init_cuda, load_triton
 from normlift_ns.core.evidence import Entries, Evidence
-from normlift_ns.core.field import CHANGED_COSINE, SemanticField
+from normlift_ns.core.field import CHANGED_COSINE, SemanticField, with_null_level
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.core.left_out import leave_views_out
 from normlift_ns.core.lift import Lifted, lift
 from normlift_ns.core.neighbors import Neighbors, nearest_neighbors
-from normlift_ns.core.null_level import with_null_level
 from normlift_ns.core.refine import (
     clamp_k,
     labeled_share,
@@ -54,9 +53,8 @@ from normlift_ns.data.alignment import alignment_warning, measure_alignment
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.data.open_scene import SplatScene, open_scene, resolve_field_paths
 from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, precomputed_features
-from normlift_ns.encoders.build import make_source, source_settings
+from normlift_ns.encoders.build import make_source, null_vectors, source_settings
 from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
-from normlift_ns.encoders.null_words import null_vectors
 from normlift_ns.errors import InputError
 from normlift_ns.evidence_collection import EvidenceCollection, RasterConfig, ViewObservations, sample_evenly
 from normlift_ns.io.memory import refuse_small_memory

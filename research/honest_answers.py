@@ -29,8 +29,8 @@ import torch
 
 from normlift_ns import nearest_neighbors, rasterize_evidence, refine
 from normlift_ns.core.evidence import Evidence
+from normlift_ns.core.field import NULL_SHARE
 from normlift_ns.core.lift import lift
-from normlift_ns.core.null_level import NULL_SHARE
 from normlift_ns.core.relevancy import relevancy, top_values
 from normlift_ns.demo.capture import demo_cameras, view_image
 from normlift_ns.encoders.base import RegionFeatures

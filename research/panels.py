@@ -24,11 +24,10 @@ from torch import Tensor
 
 from normlift_ns import LiftedRun, open_run, render
 from normlift_ns.analysis.explain import ViewVote, draw_outlines
-from normlift_ns.core.null_level import NULL_SHARE
+from normlift_ns.core.field import NULL_SHARE
 from normlift_ns.core.relevancy import relevancy
-from normlift_ns.encoders.build import restore_source
+from normlift_ns.encoders.build import null_vectors, restore_source
 from normlift_ns.encoders.cache import cached
-from normlift_ns.encoders.null_words import null_vectors
 from normlift_ns.evidence_collection import observe_views
 from normlift_ns.io.run_dir import cache_folder
 from normlift_ns.query.engine import Finding

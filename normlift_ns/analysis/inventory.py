@@ -34,7 +34,7 @@ from normlift_ns.core.evidence import Evidence
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.neighbors import nearest_neighbors
 from normlift_ns.core.sparse import SparseRows
-from normlift_ns.encoders.null_words import null_words
+from normlift_ns.encoders.build import null_words
 from normlift_ns.encoders.registry import EncoderKind, find_encoder_kind
 from normlift_ns.errors import InputError, truncate_text
 from normlift_ns.options import OBJECT_MIN_GAUSSIANS, check_prompt_list

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_args
@@ -30,7 +30,7 @@ from normlift_ns.core.lowrank import (
     store_directions,
 )
 from normlift_ns.core.partition import Partition, spatial_order
-from normlift_ns.core.relevancy import PROMPT_BLOCK, gaussian_relevancy
+from normlift_ns.core.relevancy import PROMPT_BLOCK, gaussian_relevancy, top_values
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import save_arrays
 from normlift_ns.io.field import EVIDENCE_FILE, FIELD_FILE, SCALAR_NAMES, read_field
@@ -72,7 +72,7 @@ class SemanticField(TensorRecord):
     means: Float[Tensor, "n 3"] | None = None
     """Centers of the Gaussians at the time of the lift, float32; None in fields of version 0.1."""
     null_level: Float[Tensor, " n"] | None = None
-    """Null level of every Gaussian's own direction (see `core.null_level`), or None if the encoder has no null
+    """Null level of every Gaussian's own direction (see `with_null_level`), or None if the encoder has no null
     vocabulary."""
 
     def __len__(self) -> int:
@@ -366,3 +366,39 @@ def _check_target(folder: Path, facts: Mapping[str, Any]) -> None:
         raise InputError(f"provenance or beside cannot be encoded as JSON: {error}") from None
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is not a folder; choose another path")
+
+
+# Null level of every Gaussian, the cosine that a prompt must exceed to differ from unrelated text.
+#
+# The level is the k-th largest cosine between a Gaussian and the texts of the null vocabulary. Here, k is 3 % of the
+# number of texts, rounded, and at least 2. With many texts, a prompt above the level is therefore more similar than
+# about 97 % of them. If the null vocabulary consists of the texts of a scene, at most 83, only the most similar text is
+# above the level. docs/honest_answers.md compares other shares.
+
+
+NULL_SHARE = 0.03
+"""Share of the null vocabulary that may be more similar to a Gaussian than a matching prompt."""
+_NULL_BLOCK = 32
+
+
+def with_null_level(field: SemanticField, vectors: Float[Tensor, "m d"]) -> SemanticField:
+    """Return the field with null levels.
+
+    Its manifest records the top cosine of each null text, which is the 99.9 % quantile over the Gaussians.
+
+    Args:
+        vectors: Vectors of any norm > 0, one for each of at least two texts of the null vocabulary.
+    """
+    count = max(2, round(NULL_SHARE * len(vectors)))
+    own, source = field.valid(refined=False), field.source.long()
+    valid, best = field.valid(), None
+    tops: list[float] = []
+    for block in vectors.split(_NULL_BLOCK):
+        cosine = field.query(block, refined=False).float()
+        tops += top_values(cosine[source[valid]]) if bool(valid.any()) else []
+        best = cosine if best is None else torch.cat([best, cosine], 1)
+        best = best.topk(min(count, best.shape[1]), 1).values
+    assert best is not None
+    level = torch.where(own, best[:, -1], 0.0)
+    facts = {"texts": len(vectors), "tops": sorted(round(top, 4) for top in tops)}
+    return replace(field, null_level=level, manifest={**field.manifest, "null_words": facts})

@@ -43,7 +43,7 @@ class RuleSettings(NamedTuple):
     threshold: float
     """Relevancy above which a Gaussian is selected."""
     needs_negatives: bool
-    """True if the rule needs negative prompts. "contrast" needs null levels instead (see `core.null_level`)."""
+    """True if the rule needs negative prompts. "contrast" needs null levels instead (`core.field.with_null_level`)."""
     no_direction: float
     """Relevancy of a Gaussian without a direction, which is never selected."""
     display_min: float

@@ -23,8 +23,7 @@ from torch import Tensor
 from normlift_ns.core.gaussians import SH_C0
 from normlift_ns.data.compressed_ply import normalize_quats, opacity_logits, to_bytes
 from normlift_ns.data.frames import WorldTransform
-from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, validate_splat
-from normlift_ns.data.splat_transforms import transform_splat
+from normlift_ns.data.splat import SplatFile, SplatParameters, splat_from_parameters, transform_splat, validate_splat
 from normlift_ns.data.spz import decode_spz
 from normlift_ns.data.transforms import decompose_similarity
 from normlift_ns.errors import InputError

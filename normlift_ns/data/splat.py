@@ -19,9 +19,11 @@ from torch import Tensor
 
 from normlift_ns.core.gaussians import GaussianScene
 from normlift_ns.data.compressed_ply import PACKED, unpack_compressed_ply
+from normlift_ns.data.frames import WorldTransform
 from normlift_ns.errors import InputError
 from normlift_ns.io.guard import file_kind, open_regular
 from normlift_ns.options import Primitive, RasterizeMode
+from normlift_ns.rasterization.rasterize import rotate_harmonics
 
 SH_DEGREES = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
 """Degree of the spherical harmonics, by the number of coefficients without the constant one."""
@@ -453,3 +455,19 @@ def _mode(comments: list[str]) -> RasterizeMode | None:
 def _mode_names(comments: list[str]) -> list[str]:
     pairs = [comment.partition(":") for comment in comments]
     return [value.strip() for key, _, value in pairs if key.strip().lower() == "splatrendermode"]
+
+
+def transform_splat(splat: SplatParameters, world: WorldTransform) -> SplatParameters:
+    """Return a splat that is rotated, translated and scaled together with its colors, computed in float64."""
+    rotation, translation = (torch.from_numpy(part) for part in np.split(world.transform, [3], axis=1))
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow import)
+
+    x, y, z, w = Rotation.from_matrix(rotation.numpy()).as_quat()
+    product = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
+    return replace(
+        splat,
+        means=((splat.means.double() @ rotation.T + translation.T) * world.scale).float(),
+        quats=(splat.quats.double() @ product.T).float(),
+        scales=(splat.scales.double() + np.log(world.scale)).float(),
+        features_rest=rotate_harmonics(splat.features_rest, rotation),
+    )

@@ -69,7 +69,7 @@ class EncoderKind:
     has_patches: Callable[[SourceOptions], bool] = lambda options: False
     """Function that returns True if the encoder is a `DenseEncoder`, which can embed patches."""
     has_null_words: bool = True
-    """True if the encoder can embed the words of `encoders.null_words`. If so, lifts without texts of their own use
+    """True if the encoder can embed the words of `build.null_words`. If so, lifts without texts of their own use
     these words as the null vocabulary."""
     known_words: Callable[[str], str] = str
     """Function that returns the words of a prompt that the encoder uses, or "" if the encoder ignores all of them."""

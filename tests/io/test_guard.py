@@ -192,7 +192,7 @@ def test_all_readers_use_the_one_opener() -> None:
     around = re.compile(r'^(?!.*>>>).*(\.read_(bytes|text)\(|open\("r|Image\.open\((?!stream|file,))', re.MULTILINE)
     found = {x.relative_to(root).as_posix() for x in root.rglob("*.py") if around.search(x.read_text("utf8"))}
     assert found == {
-        "encoders/open_clip.py", "encoders/null_words.py", "encoders/color.py", "encoders/imagenet.py", "registry.py",
+        "encoders/open_clip.py", "encoders/build.py", "encoders/color.py", "encoders/imagenet.py", "registry.py",
         "encoders/package_index.py", "progress.py", "server/client.py", "session/outputs.py", "io/arrays.py",
         "io/memory.py", "io/file_lock.py", "cli/demo.py", "cli/common.py",
     }  # fmt: skip

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from normlift_ns import InputError, SemanticField, open_run
 from normlift_ns.cli import query
 from normlift_ns.cli.query import answer_lines, run_repl
-from normlift_ns.core.null_level import with_null_level
+from normlift_ns.core.field import with_null_level
 from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.io.field import read_field
 from normlift_ns.options import RelevancyRule

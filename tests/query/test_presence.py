@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from normlift_ns import InputError, SemanticField
-from normlift_ns.core.null_level import with_null_level
-from normlift_ns.encoders.null_words import null_vectors, null_words
+from normlift_ns.core.field import with_null_level
+from normlift_ns.encoders.build import null_vectors, null_words
 from normlift_ns.io.field import read_field
 from normlift_ns.query.arrays import ArrayField
 from normlift_ns.query.engine import run_query
