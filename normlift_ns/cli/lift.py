@@ -321,6 +321,8 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
         before: Seconds of the stages before the lift, by name. The first includes the start of the process.
         total: Seconds of the whole command.
     """
+    from normlift_ns.query.text_encoder import encoder_name  # noqa: PLC0415 (--help does not need it)
+
     manifest: dict[str, Any] = dict(run.field.manifest)
     statistics = manifest["statistics"]
     storage = manifest["form"]
@@ -334,7 +336,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
         table.add_row("left out", f"{count} image{'s' * (count != 1)} without features")
     features = manifest["features"]
     kind = features["kind"] if "kind" in features else features["regions"]["kind"]
-    table.add_row("2D features", kind)
+    table.add_row("2D features", kind if (encoder := encoder_name(run.field)) is None else f"{encoder}, {kind}")
     if "consensus" in statistics:
         consensus = statistics["consensus"]
         levels = (describe_consensus(agreement, consensus["least"], kind) for agreement in consensus["agreement"])

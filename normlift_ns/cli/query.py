@@ -332,13 +332,17 @@ class NormLiftQuery(CheckedOptions):
             self._votes, known, transform, meters_per_unit=self.meters_per_unit, device=device
         )
         document = found.catalog.to_json()
+        print_catalog(found.catalog, self._table_coordinates)
+        texts = [item.text for item in found.catalog.objects]
+        if len(texts) > 0 and all(text.startswith("object ") for text in texts):
+            advice = "" if self.vocabulary is not None else "; give words of your own with --vocabulary FILE"
+            common.info(f"No word of the vocabulary clearly matches an object{advice}.")
         if self.output_json is not None:
             write_text_file(self.output_json, json.dumps(document, indent=2) + "\n", overwrite=self.overwrite)
         if self.objects_dir is not None:
             objects.write_catalogue(found.catalog, self.objects_dir, overwrite=self.overwrite)
         if self.image is not None:
             save_inventory(scene, found, self.image, manifest=stored.manifest, overwrite=self.overwrite)
-        print_catalog(found.catalog, self._table_coordinates)
         written = [path for path in (self.output_json, self.objects_dir, self.image) if path is not None]
         if len(written) > 0:
             common.info("Written: " + ", ".join(map(str, written)))

@@ -622,8 +622,9 @@ def _numbered(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "m h w"], names
     for number, (mask, name) in enumerate(zip(masks, names), 1):
         if not bool(mask.any()):
             continue
-        inner = torch.nn.functional.avg_pool2d(mask[None].float(), 2 * reach + 1, stride=1, padding=reach)[0]
-        y, x = divmod(int(inner.where(mask, -1.0).argmax()), width)
+        inside = mask.cpu().numpy().astype(np.float32)
+        count = cv2.boxFilter(inside, -1, (2 * reach + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        y, x = divmod(int(np.where(inside > 0, count, -1).argmax()), width)
         text = str(number) if name == f"object {number}" else f"{number} {colors.clip_text(name, 24)}"
         place = {"text": text, "font": font, "anchor": "mm"}
         left, top, right, bottom = draw.textbbox((x, y), **place)

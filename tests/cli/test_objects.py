@@ -142,7 +142,8 @@ def test_why_is_a_table_json_and_pictures(lifted: Path, tmp_path: Path, monkeypa
     names = sorted(path.name for path in pictures.iterdir())
     heaviest = [Path(view["photograph"]).stem for view in why["views"][:3]]
     assert names[:3] == [f"0_red_{i}_{stem}.png" for i, stem in enumerate(heaviest, 1)]
-    assert len(names) == 6
+    different = sum(view["agreement"] < 0.9 for view in why["views"][3:])
+    assert len(names) == 3 + min(3, different) and len({name[-8:] for name in names}) == len(names)
     assert Image.open(pictures / names[0]).size == (160, 120)
     assert run_entry(monkeypatch, query.entrypoint, *flags[:-2]) == 1
     assert "exists" in said(capsys)
