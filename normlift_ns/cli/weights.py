@@ -209,7 +209,9 @@ def _show(found: dict[str, Path | None]) -> None:
         table.add_row(name, *map(plain_text, columns))
     CONSOLE.print(table)
     CONSOLE.print(f"Searched folders: {weights_folder()} and {hub_folder('').parent}.", soft_wrap=True)
-    info("Fetch weights with: ns-normlift-weights --get imagenet edges")
+    missing = [name for name in ("imagenet", "edges") if found.get(name) is None]
+    if len(missing) > 0:
+        info(f"Fetch weights with: ns-normlift-weights --get {' '.join(missing)}")
     info("Sizes on the hub are approximate. For the terms of the training data, add --output-json FILE.")
 
 
