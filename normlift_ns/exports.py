@@ -160,8 +160,10 @@ def write_splat(
 ) -> WrittenSplat:
     """Write a splat, and the scene indices of its Gaussians in the order of the file to <stem>_rows.npy next to it.
 
-    With an answer, also write the names of its classes and objects to <stem>_names.json. PLY and GLB files contain
-    reliabilities, relevancies and labels; the other formats have no columns for them.
+    If there are instances, also write the names of classes and objects to <stem>_names.json, and if there are
+    `labels.objects`, write them to <stem>_objects.json. Otherwise, `overwrite` deletes these files of an
+    earlier export. PLY and GLB files contain reliabilities, relevancies and labels; the other formats have no columns
+    for them.
 
     Args:
         path: Path of the file.

@@ -534,7 +534,8 @@ class SourceOptions:
     level: str | None = None
     """Level of the regions. files: the index of the map in NPY files of shape [levels, H, W]. edges: s, m or l for
     about 300, 120 or 40 regions per image (None: m). sam and langsplat: s, m or l for subparts, parts or wholes (None:
-    l), or default for all masks of SAM in one map. langsplat also accepts sum, which adds the vectors of all levels."""
+    l). `default` puts all masks of SAM into one map. langsplat also accepts sum, which adds the vectors of all
+    levels."""
     features: FeatureKind = "none"
     """Precomputed regions and features to use instead of encoding the images. langsplat: files in --features-dir that
     LangSplat's preprocessing wrote. none: encode the images."""
@@ -591,9 +592,9 @@ class SplatOptions:
     x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY file. None: no search, and no
     transform except that of --gsplat-normalize."""
     gsplat_normalize: bool = True
-    """For a splat from gsplat's trainer: assume that the trainer normalized the world, unless its cfg.yml says
-    otherwise, and recompute the normalization from the COLMAP project. For other splats, --world-transform auto also
-    tries this normalization."""
+    """For a splat from gsplat's trainer: assume that the trainer normalized the world, unless the trainer's cfg.yml
+    records otherwise, and recompute the normalization from the COLMAP project. For other splats, --world-transform auto
+    also tries this normalization."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None
@@ -653,8 +654,8 @@ class RefineConfig(CheckedOptions):
     """
 
     vote: VoteKind = "posterior"
-    """Weight of a Gaussian's own evidence in the vote. posterior: its effective number of views, compared with
-    --vote-prior views for all neighbors together. paper: one vote, as for each neighbor (equations 9 and 10 of the
+    """Weight of a Gaussian's own evidence in the vote. posterior: its effective number of views; all neighbors
+    together weigh as much as --vote-prior views. paper: one vote, as for each neighbor (equations 9 and 10 of the
     paper)."""
     k: int = 36
     """Number of neighbors K in the vote, at least 1. Larger values use a wider neighborhood and take longer. Values
@@ -738,7 +739,7 @@ class LiftOptions(CheckedOptions):
     shows roughly one object. None: 0 for masks of SAM and for regions between edges, 0.4 for others. Needs --consensus
     True."""
     recognition: bool = True
-    """Measure how well a lift of half of the views recognizes the regions of the other half, for both halves. Use the
+    """Measure how well a lift of half of the views recognizes the regions of the other half, and vice versa. Use the
     result to compare captures, encoders and settings without labels. The measurement does not change the lift, and
     takes a few seconds."""
     refine: bool = True

@@ -514,14 +514,14 @@ class NormLiftBatch(CheckedOptions):
     captures: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURES")]
     """Text file with one capture per line: the path of a config.yml, a splat file or a gsplat checkpoint. Options of
     ns-normlift for this capture may follow or replace the path."""
-    options: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[-- OPTIONS]")] = ()
+    options: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[-- OPTIONS, at the end]")] = ()
     """Options of ns-normlift that apply to all captures, given after --."""
     results: Path | None = None
     """Folder for results, logs and claims, which all workers share. None: <name of the list>_batch next to the list."""
     shard: str = "auto"
     """Part of the list that this worker lifts. i/n: the i-th of n parts. none: all captures that no other worker has
     claimed. auto: the part that the variables of a SLURM job array, or RANK and WORLD_SIZE,
-    define; without them, none."""
+    define; without these variables, the same as none."""
     patience: float = 120.0
     """Take over another worker's capture after this many seconds without a heartbeat, in 1..86400. Use the same value
     for all workers. Larger values tolerate longer pauses but delay the takeover."""

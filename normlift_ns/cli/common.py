@@ -298,7 +298,7 @@ def run_command_process(command: type[CommandProtocol]) -> NoReturn:
 
 
 _process_starts: list[float] = []
-"""Start of the process of a command, as a value of `time.perf_counter`; empty if commands are called as functions."""
+"""At most one value of `time.perf_counter`, that of the start of the command's process. Functions add none."""
 
 
 def command_start() -> float:

@@ -79,7 +79,7 @@ class NormLift(CheckedOptions):
     add_images: Path | None = None
     """COLMAP project folder or transforms.json with images taken after training, which the lift then uses too. It must
     also contain two or more images of the original dataset under their original names, to align the new images. The
-    cameras of these must have the same relative poses as in training."""
+    cameras of these original images must have the same relative poses as in training."""
     check_alignment: bool = True
     """Compare up to three training images with renders of the scene before the lift. False: skip the comparison."""
     dry_run: bool = False

@@ -91,10 +91,10 @@ class NormLiftQuery(CheckedOptions):
     """Names of the training images, such as 0001 0042, whose cameras render the scene. Without names, the command uses
     three evenly spaced images."""
     explain: bool = False
-    """List the images that voted for the selection, with their weights, their agreement and the number of their
-    regions."""
+    """List the images whose evidence supports the selection, with the weight, the agreement and the number of regions
+    of each."""
     explain_dir: Path | None = None
-    """Folder for the images of --explain, with outlines of the regions that voted."""
+    """Folder for the images of --explain, with outlines of the regions that contributed."""
     segment: Literal["sam3"] | None = None
     """Also segment some training views for the prompts with this network, and lift its masks. A second table lists the
     results, with the agreement between views. sam3: SAM 3. None: no segmentation."""
@@ -558,7 +558,7 @@ def print_answer(
             common.info(f"{row['text']}: {row['verdict']}. The largest relevancy is {peak}{position}.")
     loose = [row["text"] for row in rows if _is_loose(row, question.threshold)]
     if len(loose) > 0:
-        common.info(f"If too much is selected by {', '.join(loose)}, add --threshold auto to use the suggestion.")
+        common.info(f"{', '.join(loose)} may select too much; add --threshold auto to use the suggested threshold.")
 
 
 def _is_loose(row: dict[str, Any], threshold: float) -> bool:

@@ -342,7 +342,9 @@ def _check_counts(evidence: Evidence) -> None:
 def _check_entries(name: str, part: Entries, num_gaussians: int) -> None:
     counts = part.num_regions
     if not all(0 <= count < 2**31 for count in counts) or sum(counts) + len(counts) >= 2**31:
-        raise InputError(f"{name}.num_regions must contain counts >= 0 that fit into 31 bits, got {short_repr(counts)}")
+        raise InputError(
+            f"{name}.num_regions must contain counts >= 0 whose sum fits into 31 bits, got {short_repr(counts)}"
+        )
     check_rows(f"{name}.gaussian", part.gaussian, num_gaussians)
     check_rows(f"{name}.column", part.column, sum(counts) + len(counts))
     order = part.gaussian.long() * 2**31 + part.column

@@ -167,7 +167,10 @@ class Camera:
 
     @check_arguments
     def downscaled(self, factor: float) -> Camera:
-        """Return the camera with its image size multiplied by `factor`, > 0, and rounded; factors above 1 count as 1.
+        """Return the camera of an image whose size is multiplied by `factor` and rounded.
+
+        Args:
+            factor: Positive number. Values above 1 count as 1.
 
         >>> K = torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
         >>> camera = Camera(K, torch.eye(4), width=160, height=120)

@@ -453,10 +453,10 @@ def shared_views(
 def relative_gate(cosines: Float64[Tensor, " q"], quantile: float = GATE_QUANTILE) -> tuple[float, float] | None:
     """Return tau and gamma for the cosines of `shared_region_cosines`, or None if there are fewer than 50.
 
-    Both are rounded to four digits, so that rounding errors of the lift do not change them.
+    Both are rounded to four decimal places, so that rounding errors of the lift do not change them.
 
     Args:
-        quantile: Share of the cosines that are below tau, in 0..1.
+        quantile: Share of the cosines that are below tau, in 0..1, unless tau would exceed `MAX_TAU`.
 
     >>> relative_gate(torch.linspace(0.8, 1.0, 101, dtype=torch.float64))
     (0.81, 0.095)

@@ -77,8 +77,8 @@ class Part(NamedTuple):
     """Number of Gaussians per square meter, relative to the walls."""
     shape: Distance
     paint: Callable[[Array], Array] | None = None
-    """Function that returns factors [n, 3] or [n, 1] on the color of the class at points [n, 3]; None for a plain
-    color."""
+    """Function that returns factors [n, 3] or [n, 1] by which to multiply the color of the class at points [n, 3]; None
+    for a plain color."""
     gloss: float = 0.0
     """Color value that is added where a highlight is brightest; 0 for a matte surface."""
 

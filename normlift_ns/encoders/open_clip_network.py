@@ -195,7 +195,7 @@ class OpenClipEncoder(NetworkEncoder):
 
 
 _PLAIN_KEYS = {"context_length", "vocab_size", "width", "heads", "layers"}
-"""Configuration keys of a plain text tower; any other key indicates another kind."""
+"""Configuration keys of a text tower of the standard architecture; any other key indicates another one."""
 _TEXT_BATCH_SIZE = 64
 
 
@@ -249,9 +249,9 @@ class TextTower:
 
 
 def load_text_tower(model: str, pretrained: str, template: str, device: str = "cpu") -> TextTower | None:
-    """Load the plain text tower of an OpenCLIP model, or return None if this is not possible.
+    """Load the text tower of an OpenCLIP model if it has the standard architecture of CLIP, and otherwise return None.
 
-    The result is None if the tower is of a different kind, its weights are not on this machine, or loading fails.
+    The result is None too if its weights are not on this machine, or loading fails.
     `OpenClipEncoder` then loads the model, or reports the error.
     """
     try:
@@ -291,7 +291,7 @@ def _read(path: Path, names: Mapping[str, Any]) -> dict[str, Tensor]:
 def _shapes(
     embed_dim: int, context_length: int, vocab_size: int, width: int, heads: int, layers: int
 ) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of all weights of a plain text tower."""
+    """Return the shapes of all weights of a text tower of the standard architecture."""
     block = {
         "ln_1.weight": (width,), "ln_1.bias": (width,), "ln_2.weight": (width,), "ln_2.bias": (width,),
         "attn.in_proj_weight": (3 * width, width), "attn.in_proj_bias": (3 * width,),

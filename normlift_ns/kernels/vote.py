@@ -1,6 +1,7 @@
 """Triton kernel of the vote, with one Gaussian per program and a small matrix product for the cosines of its neighbors.
 
-Float32 rows u are split into u = h + l, with 11 bits each. Three products at the fastest rate of tensor cores,
+Float32 rows u with D components are split into u = h + l, two float16 numbers with 11 significant bits each. The vote
+uses the sigmoid g = 1 / (1 + exp(-(cosine - tau) / gamma)). Three products at the fastest rate of tensor cores,
 h h + h l + l h, give cosines with 22 bits. Most votes need only the first product.
 
 Let e be the largest |l| of a Gaussian and its neighbors. Assume that all products and sums are exact except for

@@ -83,7 +83,11 @@ def _histograms(values: Float[Tensor, "q m"], threshold: float, positions: tuple
 
 
 def _weighted_means(chosen: Bool[Tensor, "q n"], weighted: Float64[Tensor, "n 5"]) -> list[list[float]]:
-    """Return the weighted means of the chosen centers and reliabilities; the last column holds the weights."""
+    """Return the weighted mean center and reliability of the Gaussians that each prompt chooses.
+
+    Args:
+        weighted: x, y, z and R of every Gaussian, multiplied by its weight, and the weight itself.
+    """
     sums = chosen.double() @ weighted
     return (sums[:, :4] / sums[:, 4:]).tolist()
 

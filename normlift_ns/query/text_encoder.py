@@ -144,9 +144,10 @@ def _cached_texts(
         encoder = make_encoder(options, choose_device(device))
         if len(recorded) > 0 and json.dumps(encoder.identity, sort_keys=True) != json.dumps(recorded, sort_keys=True):
             raise InputError(
-                f"The encoder {options.encoder} is not the encoder of the lift, so results would differ. It is "
-                f"{encoder.identity}, expected {dict(recorded)}. Restore its files, give a file of text vectors from "
-                "the same network with --text-embeddings, or lift again with: ns-normlift"
+                f"The encoder {options.encoder} on this machine differs from the one that the lift used, so results "
+                f"would differ. Its settings are {encoder.identity}, expected {dict(recorded)}. Restore the original "
+                "files of the encoder, give a file of text embeddings from the same network with --text-embeddings, or "
+                "lift again with: ns-normlift"
             )
         return encoder
 
@@ -178,9 +179,9 @@ def _check_vectors(path: Path, expected: object) -> None:
         "with: ns-normlift"
     )
     if os.path.lexists(path) and not path.is_file():
-        raise InputError(f"the run's file of text vectors {path} is no longer a regular file; {remedy}")
+        raise InputError(f"the run's file of text embeddings {path} is no longer a regular file; {remedy}")
     if not path.is_file():
-        raise FileNotFoundError(f"the run's file of text vectors {path} does not exist; {remedy}")
+        raise FileNotFoundError(f"the run's file of text embeddings {path} does not exist; {remedy}")
     if isinstance(expected, str) and (actual := TextEmbeddingFile(path).identity["content"]) != expected:
         raise InputError(
             f"{path} is not the file that the lift used, so results would differ. The digest of its content is "

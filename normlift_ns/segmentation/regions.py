@@ -355,8 +355,9 @@ _FAR = 1e4
 """Coordinates of centers that no pixel joins."""
 _AROUND = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1))
 _WHITE = (0.95047, 1.0, 1.08883)
+"""XYZ of white for the illuminant D65."""
 _XYZ = ((0.412453, 0.357580, 0.180423), (0.212671, 0.715160, 0.072169), (0.019334, 0.119193, 0.950227))
-"""XYZ of the sRGB primaries, and that of white, for the illuminant D65."""
+"""XYZ of the sRGB primaries for the illuminant D65, one column each."""
 _LAB = ((0.0, 116.0, 0.0), (500.0, -500.0, 0.0), (0.0, 200.0, -200.0))
 
 
