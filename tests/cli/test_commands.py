@@ -293,7 +293,7 @@ def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, litt
     write_ply(ply.parent / "bent.ply", {**splat, "x": 2 * splat["x"]})  # in no world
     given = ("--transforms", little.parents[4] / "room", *SMALL, "--timestamp", "a", "--max-views", "2")
     for kind, name, *facts in (
-        ("ply", "points.ply", "not a splat", "5", "f_dc_0"),
+        ("ply", "points.ply", "not a splat", "f_dc_0"),
         ("gsplat", "other.pt", "normalized"),
         ("ply", "bent.ply", "dB", "--world-transform"),
         ("ply", "far.ply", "do not show this splat"),

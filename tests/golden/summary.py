@@ -42,6 +42,23 @@ SAME_SOURCES, LOOSE, FEW = 0.9, 0.01, 5
 """On another machine: the share of equal sources, how far floats may be apart, and whole numbers at least."""
 
 
+_LIFT = """
+import sys
+import numpy as np
+from skimage.segmentation import slic
+from normlift_ns.cli.lift import entrypoint
+from normlift_ns.segmentation import regions
+
+def superpixels(image, count):
+    labels = slic(image.numpy(), n_segments=count, compactness=10.0, start_label=0)
+    return np.unique(labels, return_inverse=True)[1].reshape(labels.shape).astype(np.int32)
+
+regions.superpixels = superpixels
+entrypoint()
+"""
+"""ns-normlift with the superpixels of versions 0.1 and 0.2, which are those of scikit-image."""
+
+
 def run_commands(scene: str, config: Path, folder: Path) -> None:
     """Lifts a run (8 views, half resolution, colour encoder, the method of version 0.1), asks it and exports what is
     found.
@@ -65,7 +82,8 @@ def single_colors(path: Path) -> Path:
 
 def _command(name: str, *flags: object) -> None:
     threads = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2", "CUDA_VISIBLE_DEVICES": ""}
-    words = [str(Path(sys.executable).with_name(name)), *map(str, flags)]
+    start = [sys.executable, "-c", _LIFT] if name == "ns-normlift" else [str(Path(sys.executable).with_name(name))]
+    words = [*start, *map(str, flags)]
     done = subprocess.run(words, env=os.environ | threads, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 
