@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cache
@@ -133,7 +134,7 @@ def null_vectors(
 
     The vocabulary consists of the prompts that were supplied with precomputed features or in a file of text embeddings.
     For other lifts, it is `null_words`. The result is None if the vocabulary has fewer than five words, or the encoder
-    cannot embed them.
+    cannot embed them. If its weights are missing, the function also warns.
 
     Args:
         encoder: Encoder settings from the manifest.
@@ -155,4 +156,8 @@ def null_vectors(
     try:
         return texts.text(words)
     except InputError:  # the encoder cannot embed these words
+        return None
+    except FileNotFoundError as error:
+        remark = "queries of this run cannot compare with unrelated words, because the text encoder cannot be loaded"
+        warnings.warn(f"{remark}: {error}", stacklevel=2)
         return None

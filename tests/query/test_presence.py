@@ -81,3 +81,10 @@ def test_the_vectors_of_the_null_words_are_kept_for_later_lifts(tmp_path):
     other: Any = SimpleNamespace(identity={"weights": "b"}, text=text)
     assert null_vectors(other, encoder, tmp_path) is not None
     assert len(asked) == 2
+
+    def missing(words):
+        raise FileNotFoundError("weights x are missing")
+
+    lost: Any = SimpleNamespace(identity={"weights": "c"}, text=missing)
+    with pytest.warns(UserWarning, match="unrelated words.*weights x"):
+        assert null_vectors(lost, encoder, tmp_path) is None  # the lift goes on
