@@ -732,7 +732,7 @@ def lift_statistics(
 
     Args:
         reliability: R of all Gaussians.
-        facts: Statistics of the consensus and the vote.
+        facts: Statistics of the consensus, the recognition and the vote, if they are enabled.
     """
     positive = reliability[reliability > 0].double().sort().values
     n, count, shares = reliability.numel(), len(positive), (0.05, 0.25, 0.5, 0.75, 0.95)

@@ -86,7 +86,7 @@ class Inventory:
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Candidate names of objects, with the text encoder and the queries of a run."""
+    """Candidate names of objects, with functions that encode words and search the run."""
 
     words: tuple[str, ...]
     kind: EncoderKind | None

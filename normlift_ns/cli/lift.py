@@ -94,7 +94,7 @@ class NormLift(CheckedOptions):
     timestamp: str | None = None
     """Name of the new run directory. None: the current time."""
     overwrite: bool = False
-    """Replace an existing run directory with the same time stamp, and exported files whose content differs."""
+    """Replace an existing run directory that has the same --timestamp, and exported files whose content differs."""
     device: str = "auto"
     """Device to lift on: auto, cpu or cuda."""
     num_devices: int = 1

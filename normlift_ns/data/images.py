@@ -230,7 +230,7 @@ class SplitViews:
                 message gives its path.
         """
         if not -len(self) <= index < len(self):
-            raise IndexError(f"view {index} of {len(self)}")
+            raise IndexError(f"view {index} does not exist; the number of views is {len(self)}")
         index %= len(self)
         distorted, distorted_mask = self._read(index)
         image, mask, was_distorted = self._undistort(index, distorted, distorted_mask)

@@ -624,10 +624,10 @@ def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World
     Raises:
         ValueError: The matrix does not consist of a rotation, a scale and a translation.
     """
-    if matrix.shape != (4, 4) or not (np.abs(matrix) < _MAX_VALUE).all():
-        raise InputError(
-            f"{source} has the shape {matrix.shape}, or numbers that are not finite. Expected 4 x 4 finite numbers."
-        )
+    if matrix.shape != (4, 4):
+        raise InputError(f"{source} has the shape {matrix.shape}. Expected 4 x 4 numbers.")
+    if not (np.abs(matrix) < _MAX_VALUE).all():
+        raise InputError(f"{source} has numbers that are not finite. Expected 4 x 4 numbers between -1e30 and 1e30.")
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
     last = np.abs(matrix[3] - [0, 0, 0, 1]).max()

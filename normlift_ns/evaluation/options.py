@@ -47,11 +47,10 @@ class ScannetOptions(CheckedOptions):
     min_opacity: float = 0.1
     """Smallest opacity of a scored Gaussian, in 0..1. With larger values, fewer Gaussians are scored."""
     without_direction: WithoutDirection = "first"
-    """Class of Gaussians without a direction. first assigns wall, as in published scripts. none assigns no class. The
-    table also shows the result of the other choice."""
+    """Class of Gaussians without a direction. first: the class wall, as in published scripts. none: no class. The table
+    also shows the result of the other choice."""
     spelling: Literal["script", "paper"] = "script"
-    """Spelling of one prompt. script uses "showercurtain", as in OpenGaussian's script. paper uses "shower
-    curtain"."""
+    """Spelling of one prompt. script: "showercurtain", as in OpenGaussian's script. paper: "shower curtain"."""
 
 
 @dataclass(frozen=True)
@@ -59,22 +58,22 @@ class LerfOptions(CheckedOptions):
     """Options of --protocol lerf, which needs one folder of label files per run in --labels."""
 
     masking: Masking = "background"
-    """Conversion of scores to masks. background selects pixels whose score exceeds that of every background word by
-    more than --margin. auto applies the threshold of Splat Feature Solver, from the histogram of an image's scores and
-    the true number of objects. langsplat thresholds LERF's relevancy of composited features, normalized per pixel, as
-    in LangSplat. langsplat_composited computes this relevancy from composited scores instead."""
+    """Conversion of scores to masks. background: select pixels whose score exceeds that of every background word by
+    more than --margin. auto: apply the threshold of Splat Feature Solver, from the histogram of an image's scores and
+    the true number of objects. langsplat: threshold LERF's relevancy of composited features, normalized per pixel, as
+    in LangSplat. langsplat_composited: the same relevancy, computed from composited scores."""
     margin: float = MASK_MARGIN
     """Lead over the best background word for --masking background, in cosine. Larger values give smaller masks. The
     code of Splat Feature Solver uses 0."""
     average: AveragingOrder = "frames"
-    """Averaging within a scene. frames averages the categories of each frame, then the frames. pairs averages all
-    pairs of frame and category. categories averages the frames of each category, then the categories."""
+    """Averaging within a scene. frames: average the categories of each frame, then the frames. pairs: average all
+    pairs of frame and category. categories: average the frames of each category, then the categories."""
     clean: bool = False
-    """Open and close each mask, keep its largest component and fill its holes, as in the code of Splat Feature Solver.
-    Pixels at the image border are lost. The paper does not specify this step."""
+    """Open and close each mask (morphology), keep its largest component and fill its holes, as in the code of Splat
+    Feature Solver. Pixels at the image border are lost. The paper does not specify this step."""
     scale: Literal["unit", "norm"] = "unit"
-    """Scores to composite. unit composites cosines. norm composites cosines times ||f||, the norm of the mean feature,
-    as in Splat Feature Solver, which does not normalize features."""
+    """Scores to composite. unit: cosines. norm: cosines times ||f||, the norm of the mean feature, as in Splat Feature
+    Solver, which does not normalize features."""
 
 
 @dataclass(frozen=True)

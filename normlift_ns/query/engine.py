@@ -61,7 +61,7 @@ class QueryField(HasManifest, Protocol):
         ...
 
     def query(self, text_vectors: Float[np.ndarray, "q d"], *, refined: bool = True) -> Any:
-        """Return the cosine of every Gaussian's direction to Q vectors."""
+        """Return the cosines between the direction of every Gaussian and Q vectors."""
         ...
 
     def null_levels(self, *, refined: bool = True) -> Any:

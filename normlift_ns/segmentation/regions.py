@@ -388,7 +388,7 @@ def superpixels(image: UInt8[Tensor, "h w 3"], count: int) -> Int32[np.ndarray, 
 
 @dataclass(frozen=True)
 class _Grid:
-    """A grid of cells over an image, the last of which can extend beyond its right and lower borders."""
+    """A grid of cells over an image. The last row and column can extend beyond the image."""
 
     rows: int
     columns: int

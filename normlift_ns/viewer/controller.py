@@ -57,7 +57,7 @@ class Session:
     """Queries and clicks of one user, kept while the viewer runs."""
 
     history: History[State] | None = None
-    """History of states; None before the first field."""
+    """History of states; None until the semantics of a run are loaded."""
     line: str = ""
     """Text in the prompt box."""
     clicks: dict[str, Any] = field(default_factory=dict)
@@ -108,7 +108,7 @@ class Controller(ABC):
 
     @property
     def state(self) -> State | None:
-        """Current state; None before the first field."""
+        """Current state; None until the semantics of a run are loaded."""
         return None if self._session.history is None else self.history.now
 
     def act(self, action: Action, value: Any = None, client: Any = None) -> None:
