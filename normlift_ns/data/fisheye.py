@@ -63,10 +63,10 @@ def _pinhole(lens: Intrinsics) -> _Pinhole:
     if is_seen.mean() < _MIN_SHARE:
         raise InputError(
             f"only {is_seen.mean():.0%} of its pixels (fx {lens.fx:g}, {lens.width} x {lens.height} pixels, k1 to k4 "
-            f"{[*lens[6:9], lens.k4]}) lie within {math.degrees(MAX_ANGLE):.0f} degrees of the optical axis, "
-            f"expected at least {_MIN_SHARE:.0%}. The focal length or the distortion is probably wrong. Correct them, or undistort "
-            "the images to a smaller angle, for example with colmap image_undistorter, and give the new images and "
-            "cameras"
+            f"{[*lens[6:9], lens.k4]}) lie within {math.degrees(MAX_ANGLE):.0f} degrees of the optical axis, expected "
+            f"at least {_MIN_SHARE:.0%}. The focal length or the distortion is probably wrong. Correct them, or "
+            "undistort the images to a smaller angle, for example with colmap image_undistorter, and give the new "
+            "images and cameras"
         )
     lost = int((1 - KEPT_SHARE - _SAMPLING_ERROR) * len(limits))
     factor = np.partition(limits, lost)[lost] or limits[is_seen].min()
