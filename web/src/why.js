@@ -9,22 +9,22 @@ export function showExplanation(message, closed) {
     $("why").hidden = true;
     closed();
   };
-  const group = (/** @type {string} */ title, /** @type {any[]} */ entries, /** @type {string} */ of) =>
-    entries.length > 0 &&
-    h("div", {}, h("h3", {}, title), h("div.images", {}, ...entries.map((entry) => figure(entry, of))));
+  const group = (/** @type {string} */ title, /** @type {any[]} */ entries) =>
+    entries.length > 0 && h("div", {}, h("h3", {}, title), h("div.images", {}, ...entries.map(figure)));
+  const title = message.name === "selection" ? "Why? " : `Why ${message.name}? `;
   $("why").replaceChildren(
     h(
       "div.row.spread",
       {},
-      h("p", {}, h("b", {}, message.name === "selection" ? "Why? " : `Why ${message.name}? `), message.text, message.problem ? h("span.warn", {}, ` ${message.problem}`) : ""),
+      h("p", {}, h("b", {}, title), message.text, message.problem ? h("span.warn", {}, ` ${message.problem}`) : ""),
       button("Close", "clear", "Close", "Escape", close, { bare: true }),
     ),
     h(
       "div.groups",
       {},
       ...[
-        group("Strongest support", message.support ?? [], "agreement"),
-        group("Images that disagree", message.disagreement ?? [], "disagreement"),
+        group("Strongest support", message.support ?? []),
+        group("Images that disagree", message.disagreement ?? []),
       ].filter(Boolean),
     ),
   );
@@ -39,8 +39,8 @@ export function closeStaleExplanation(state) {
   if (!panel.hidden && panel.dataset.selected !== String(state.selected)) panel.querySelector("button")?.click();
 }
 
-/** @param {any} entry @param {string} of */
-function figure(entry, of) {
+/** @param {any} entry */
+function figure(entry) {
   const label = `${entry.name}, ${Math.round(100 * entry.share)}\u00a0% of the weight`;
   const enlarge = () => {
     const dialog = h(
@@ -67,6 +67,6 @@ function figure(entry, of) {
           onkeydown: (/** @type {KeyboardEvent} */ event) => event.key === "Enter" && enlarge(),
         })
       : h("p.soft", {}, "No image"),
-    h("figcaption", {}, label, Number.isFinite(entry[of]) ? `, ${of} ${entry[of].toFixed(2)}` : ""),
+    h("figcaption", {}, label, Number.isFinite(entry.agreement) ? `, agreement ${entry.agreement.toFixed(2)}` : ""),
   );
 }
