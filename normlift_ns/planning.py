@@ -457,10 +457,10 @@ def missing_weights(options: SourceOptions, device: str) -> list[str]:
     return missing + [f"weights for {file.user} ({file.command})" for file in files]
 
 
-def diagnose_weights(options: SourceOptions, device: str) -> Diagnostic:
-    """Check that all weights are on this machine, and name the encoder and the regions of the lift."""
-    missing, options = missing_weights(options, device), resolve_source(options, device)
+def diagnose_weights(missing: Sequence[str], options: SourceOptions, device: str) -> Diagnostic:
+    """Report weights that are not on this machine; if none is missing, name the encoder and the regions of the lift."""
     if len(missing) == 0:
+        options = resolve_source(options, device)
         used = f" (encoder {options.encoder}, regions {options.regions})" if options.features == "none" else ""
         return Diagnostic("weights", "ok", f"all required weights are on this machine{used}")
     message = f"not on this machine: {'; '.join(missing)}. A lift downloads only those from the Hugging Face hub"

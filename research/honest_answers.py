@@ -6,8 +6,8 @@
 Writes results/honest_answers.json. CLIP-like features are made as in `damage`, of vectors of LVIS names: those of the
 scene's classes (in the plain room 13 names drawn at random), four others as negatives, and 200 others as the unrelated
 words of rule contrast. 60 names more, none closer to a class than a cosine of 0.9, are asked for as well and are in no
-scene. The colour encoder looks at pictures of the plain room, cut into superpixels and into squares; words that are not
-in the scene are all names of the XKCD survey whose cosine to every colour of the room is below 0.5.
+scene. The encoder color sees images of the plain room, cut into superpixels and into squares; words that are not
+in the scene are all names of the XKCD survey whose cosine to every color of the room is below 0.5.
 
 Keys: <scene>.<damage or cut>.<rule>.
   iou.<threshold>     mean IoU over the classes of what is selected at a threshold: fixed (0.5, colors 0.7), suggested,
@@ -166,7 +166,7 @@ def clip_like(report: Report, world: World) -> None:
 
 
 def colours(report: Report, num_gaussians: int, views: int, width: int) -> None:
-    """Rows of the plain room, seen by the colour encoder."""
+    """Add the rows of the plain room, seen by the encoder color."""
     from matplotlib.colors import XKCD_COLORS  # noqa: PLC0415 (the names)
 
     room, cameras, texts = plain_room(num_gaussians), demo_cameras(views, width, width * 3 // 4), ColorEncoder()

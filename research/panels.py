@@ -148,7 +148,7 @@ def draw(run: LiftedRun, view: str, text: str) -> Figure:
     """Draw the panels of an answer in a view."""
     name = next((x for x in run.scene.train.names if view in (x, Path(x).name, Path(x).stem)), None)
     if name is None:
-        raise SystemExit(f"there is no training image {view!r}, but {', '.join(run.scene.train.names)}")
+        raise SystemExit(f"{view!r} is not a training image; choose one of: {', '.join(run.scene.train.names)}")
     story = Story(run, name, run.ask(text)[text])
     panels = list(story_panels(story))
     height = WIDTH * panels[0][1].shape[0] / panels[0][1].shape[1] + TITLE

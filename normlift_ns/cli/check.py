@@ -79,7 +79,7 @@ class NormLiftCheck(NormLift):
         options, request = self.source.looking_for(self.queries), self.request()
         source = _try(rows, "2D features", lambda: make_source(options, device))
         missing = [] if source is None else planning.missing_weights(options, device)
-        rows += [] if source is None else [planning.diagnose_weights(options, device)]
+        rows += [] if source is None else [planning.diagnose_weights(missing, options, device)]
         opened = _try(rows, "capture", lambda: planning.open_capture(request, start_time))
         if opened is None:
             return rows, None

@@ -489,13 +489,13 @@ def _join_fragments(labels: Int32[np.ndarray, "h w"], smallest: float) -> Int32[
 
 def _connected_pieces(labels: Int32[np.ndarray, "h w"]) -> tuple[Int32[np.ndarray, "h w"], int]:
     """Return the piece of each pixel, and the number of pieces. Pixels connect to equal ones on their four sides."""
+    import cv2  # noqa: PLC0415 (other regions do not need it)
+
     height, width = labels.shape
     links = np.zeros((2 * height - 1, 2 * width - 1), dtype=np.uint8)  # pixels at even places, links between them
     links[::2, ::2] = 1
     links[::2, 1::2] = labels[:, 1:] == labels[:, :-1]
     links[1::2, ::2] = labels[1:] == labels[:-1]
-    import cv2  # noqa: PLC0415 (other regions do not need it)
-
     count, pieces = cv2.connectedComponents(links, connectivity=4, ltype=cv2.CV_32S)
     return pieces[::2, ::2] - 1, count - 1
 
