@@ -81,15 +81,10 @@ def test_labels_of_lerf_say_what_is_wrong(tmp_path: Path) -> None:
     for path, value, message in (
         (("info", "width"), 0, r"`int` >= 1 - at `\$\.info\.width`"),
         (("info", "width"), 10**9, "`int` <= 32768"),
-        (("info", "height"), True, "`int`, got `bool`"),
-        (("info", "height"), "30", "`int`, got `str`"),
-        (("objects",), {}, "`array`, got `object`"),
         (("objects", 0, "category"), "", "regex"),
-        (("objects", 0, "category"), 3, "`str`, got `int`"),
         (("objects", 0, "segmentation"), [[1, 2]], "length >= 3"),
         (("objects", 0, "segmentation", 1), [1e9, 3], r"40 x 30 .* 1e\+09"),
         (("objects", 0, "segmentation", 1), [1, 2, 3], "length 2"),
-        (("objects", 0, "segmentation", 1, 0), float("nan"), "NaN"),
         (("objects", 0, "bbox"), [1, 2, 3], "length 4"),
         (("objects", 0, "bbox"), [0, 0, -1e12, 5], r"1e\+12"),
     ):
@@ -102,14 +97,10 @@ def test_names_say_what_is_wrong(tmp_path: Path) -> None:
     for text, message in (
         ('{"labels": {"1": "a", "1": "b"}}', "'1' .*twice"),
         ('{"labels": {"01": "a"}}', "'01'"),
-        ('{"labels": {"1": null}}', "`str`, got `null`"),
-        ('{"labels": {"1": 2}}', "`str`, got `int`"),
         ('{"labels": {"1": " "}}', "regex"),
         ('{"labels": {"0": "a"}, "background": 0}', "0 is the background"),
-        ('{"labels": {"1": "a"}, "background": true}', r"`int \| null`, got `bool`"),
         ('{"labels": {"' + "9" * 5000 + '": "a"}}', "not a mask value"),
-        ("[" * 100000, "RecursionError"),
-        *((text, "") for text in ("[1]", '{"labels": {}}', '{"labels": {"a": "b"}}', "{")),
+        *((text, "") for text in ('{"labels": {}}', '{"labels": {"a": "b"}}', "{")),
         ('{"labels": {"1": "\\ud800"}}', "regex"),
     ):
         (tmp_path / "labels.json").write_text(text)
@@ -139,7 +130,6 @@ def test_ids_of_another_list_are_refused_or_warned_of(tmp_path: Path) -> None:
         (np.array([1163, 1165], np.int32), "NYU40"),
         (np.array([1.5, 2]), "32-bit integers"),
         (np.array([np.nan, 2]), "32-bit integers"),
-        (np.array([1e300, 2]), "32-bit integers"),
     ):
         path.write_bytes(ply(labels))
         with pytest.raises(InputError, match=rf"a\.ply.*{message}"):
@@ -158,7 +148,9 @@ def test_masks_are_read_as_carefully_as_label_maps(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"a\.npy has .* its image x/a\.png is 2 x 3") as caught:
             read_classes(masks, "x/a.png", names, 2, 3)
         assert str(array.shape) in str(caught.value)
-    np.save(tmp_path / "a.npy", np.array([[-(2**62), 7, 2**62]]))
-    assert read_classes(masks, "x/a.png", names, 1, 3).tolist() == [[-1, 0, -1]]
+    np.save(tmp_path / "a.npy", np.array([[0, 1, 2], [-(2**62), 7, 2**62]]))
+    assert read_classes(masks, "x/a.png", names, 2, 3).tolist() == [[-1, 0, 1], [-1, 0, -1]]
+    with pytest.raises(FileNotFoundError, match="b"):
+        read_classes(masks, "x/b.png", names, 2, 3)
     with pytest.raises(FileNotFoundError, match=r"nowhere .*--labels"):
         LabelFiles(tmp_path / "nowhere", description="instance mask", flag="--labels")

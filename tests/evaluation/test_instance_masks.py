@@ -3,16 +3,13 @@
 import json
 import math
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from normlift_ns import Evidence
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.evaluation.options import Evaluation, write_evaluation
-from normlift_ns.evaluation.protocols import evaluate_masks, gaussian_truth, read_classes, read_names
-from normlift_ns.segmentation.regions import LabelFiles
+from normlift_ns.evaluation.protocols import evaluate_masks, gaussian_truth, read_names
 
 
 def test_names_join_equal_classes(tmp_path):
@@ -23,15 +20,6 @@ def test_names_join_equal_classes(tmp_path):
     assert names.class_of == {1: 0, 2: 1, 7: 0}
     path.write_text('{"3": "cup"}')
     assert read_names(path).class_of == {3: 0}
-
-
-def test_masks_become_classes(tmp_path):
-    (tmp_path / "labels.json").write_text('{"1": "a", "2": "b", "7": "a"}')
-    Image.fromarray(np.array([[0, 1], [2, 7], [9, 1]], dtype=np.uint8)).save(tmp_path / "0001.png")
-    masks, names = LabelFiles(tmp_path), read_names(tmp_path / "labels.json")
-    assert read_classes(masks, "images/0001.jpg", names, 3, 2).tolist() == [[-1, 0], [1, 0], [-1, 0]]
-    with pytest.raises(FileNotFoundError, match="0002"):
-        read_classes(masks, "images/0002.jpg", names, 3, 2)
 
 
 def test_truth_needs_purity_and_weight():

@@ -112,8 +112,7 @@ def test_the_majority_is_langsplats_up_to_the_border():
     assert not lerf.prompt_mask(inside, none, "langsplat", margin=0, instances=1)[-3].any()
 
 
-def test_two_empty_masks():
-    """SFS's code gives 0; LangSplat's divides 0 by 0."""
+def test_two_empty_masks():  # SFS's code gives 0; LangSplat's divides 0 by 0
     nothing = torch.zeros(4, 4, dtype=torch.bool)
     scores = lerf.FrameScores(frame_of({"egg": nothing}), torch.zeros(4, 4, 1), torch.ones(4, 4, 8))
     assert lerf.frame_rows(scores, "background", margin=0, clean=False)[0]["iou"] == 0

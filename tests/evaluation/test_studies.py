@@ -61,8 +61,7 @@ def test_scenes_are_pooled_gaussian_by_gaussian():
     assert [row["scene"] for row in rows] == ["a", "b", studies.POOLED_SCENE]
     of_a, of_b, pooled = rows
     assert pooled["zero.share"] == pytest.approx((300 * of_a["zero.share"] + 900 * of_b["zero.share"]) / 1200)
-    r = torch.cat([s.scalars.reliability for s in scenes])
-    o = torch.cat([s.opacity for s in scenes])
+    r, o = torch.cat([s.scalars.reliability for s in scenes]), torch.cat([s.opacity for s in scenes])
     assert pooled["opacity.kendall"] == pytest.approx(kendalltau(r[r > 0].double(), o[r > 0].double()).statistic)
     assert pooled["opacity.kendall"] not in (of_a["opacity.kendall"], of_b["opacity.kendall"])
     assert [row["scene"] for row in studies.signal_rows(["a"], scenes[:1])] == ["a"]
@@ -103,14 +102,12 @@ def test_runs_lifted_differently_are_swept_over_the_same_values():
 
 
 def test_sweeps_mark_the_default_and_the_run_and_draw_the_result(tmp_path):
-    from normlift_ns.evaluation.studies import save_figure, sweeps_figure  # noqa: PLC0415
-
     rows = [{"parameter": "$\\frac{$", "value": x, "$\\frac{$": x} for x in (1.0, 2.0)]  # not mathematics
-    save_figure(sweeps_figure(rows, "$\\frac{$", "$\\frac{$"), tmp_path / "a.svg")
+    studies.save_figure(studies.sweeps_figure(rows, "$\\frac{$", "$\\frac{$"), tmp_path / "a.svg")
     assert (tmp_path / "a.svg").stat().st_size > 1000
     values = [("k", 12.0, False, True, 0.4), ("k", 36.0, True, False, 0.5), ("beta", 1.0, True, True, 0.4)]
     rows = [{"parameter": p, "value": v, "default": d, "own": o, "miou": y} for p, v, d, o, y in values]
-    of_k, of_beta = sweeps_figure(rows[::-1], "miou", "miou", 0.45).axes[::-1]
+    of_k, of_beta = studies.sweeps_figure(rows[::-1], "miou", "miou", 0.45).axes[::-1]
     assert [x.get_xlabel() for x in (of_k, of_beta)] == ["k", "beta"]
     curve, default, own, result = of_k.lines
     assert (list(curve.get_xdata()), list(curve.get_ydata())) == ([0, 1], [0.4, 0.5])

@@ -53,14 +53,3 @@ def test_equals_masks_that_are_made(side, scaled, size, dtype):
     assert boxes[-1].tolist() == [0, 0, 0, 0] and inner[-1] == outer[-1] == 0
     assert boxes[-2].tolist() == [0, 0, size[1] - 1, size[0] - 1] and inner[-2] == size[0] * size[1]
     assert 0 < int(expected.inner[3]) < int(expected.outer[3]) or min(size) == 1
-
-
-def test_three_logits_make_a_pixel():
-    for count, side, scaled, size in ((8, 32, 20, 31), (256, 1024, 757, 731), (3, 12, 12, 5)):
-        first, weights = bilinear_weights(count, side, scaled, size)
-        line = torch.randn(count, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        whole = interpolate(line[None, None], side, mode="linear", align_corners=False)[:, :, :scaled]
-        expected = interpolate(whole, size, mode="linear", align_corners=False)[0, 0]
-        found = (line[first[:, None] + torch.arange(3)] * weights).sum(dim=1)
-        torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
-        assert int(first.min()) >= 0 and int(first.max()) <= count - 3

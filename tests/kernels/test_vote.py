@@ -1,7 +1,6 @@
 """The kernel's vote against the plain one."""
 
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import pytest
@@ -212,15 +211,6 @@ def test_refine_with_kernels_gives_one_answer_however_directions_are_given(monke
     assert torch.equal(half, rounded)
     lost = unsupported(near, reliability)
     assert lost.tolist() == [False] * 35 + [True] * 10
-
-
-def test_nothing_changes_where_nobody_is_reliable():
-    neighbors = nearest_neighbors(torch.randn(10, 3, generator=generator(0)), 4)
-    directions, reliability = unit_rows(10, 16, 0, torch.float32), torch.zeros(10)
-    for kind, voters in product(("paper", "posterior"), (0, 10)):
-        own = {"own": torch.ones(10, device=DEVICE)} if kind == "posterior" else {}
-        found = cast(neighbors, directions, reliability, RefineConfig(vote=kind, k=4), voters, **own)
-        assert bool((found == -1).all()), kind  # nothing written
 
 
 def test_spatial_order_is_a_permutation_that_keeps_neighbours_together():

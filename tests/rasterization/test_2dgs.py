@@ -6,12 +6,10 @@ import pytest
 import torch
 
 from normlift_ns import GaussianScene, RasterSettings, rasterize_evidence, render
-from normlift_ns.rasterization import gsplat
 from normlift_ns.rasterization.rasterize import RasterJob
 from tests.kernels.test_regions import assert_same, hard_scene, kernel_evidence
-from tests.random_scenes import dense, generator, orbit, orbit_camera, random_labels, random_scene
+from tests.random_scenes import dense, orbit, orbit_camera, random_labels, random_scene
 from tests.rasterization.oracle import compositing_matrix_2d
-from tests.rasterization.test_numba import shapes_of_all_kinds
 
 
 def flat(scene: GaussianScene) -> GaussianScene:
@@ -46,23 +44,6 @@ def test_projection_is_that_of_gsplat():
     assert torch.allclose(found["transforms"], transforms[0, rows].mT, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
-def test_numba_equals_the_reference(dtype, tolerance):
-    scene, camera = flat(shapes_of_all_kinds(80, 5, dtype)), orbit_camera(0.4, width=45, height=38)
-    values = torch.rand(80, 3, generator=generator(1), dtype=dtype)
-    for size, power, regions in ((16, 1, 40), (16, 0, 3), (20, 2, 3)):
-        labels, rules = [random_labels(camera, regions)], RasterSettings(tile_size=size)
-        options = {"num_regions": [regions], "weight_power": power, "settings": rules}
-        found, expected = (
-            dense(rasterize_evidence(scene, [camera], labels, backend=name, **options).rows, regions)
-            for name in ("numba", "torch")
-        )
-        assert (found - expected).abs().max() < tolerance * expected.max(), (size, power, regions)
-        images = [render(scene, camera, values, settings=rules, backend=name) for name in ("numba", "torch")]
-        for ours, exact in zip(*images):
-            assert (ours - exact).abs().max() < max(tolerance, 1e-6), size
-
-
 @pytest.mark.parametrize("kind", ["random", "hard"])
 def test_triton_equals_the_reference(kind):
     scene = flat(hard_scene() if kind == "hard" else random_scene(25, dtype=torch.float32))
@@ -80,9 +61,3 @@ def test_what_2d_gaussians_do_not_have_is_refused():
         render(scene, camera, torch.ones(5, 1), rasterize_mode="antialiased")
     with pytest.raises(ValueError, match=r"2D Gaussians .*gsplat 1\.4"):
         render(scene, camera, torch.ones(5, 1), settings=RasterSettings.of_gsplat("1.5"))
-
-
-def test_gsplat_backend_draws_3d_gaussians_only(monkeypatch):
-    monkeypatch.setattr(gsplat, "check_gpu", lambda *_: None)
-    with pytest.raises(ValueError, match=r'3D Gaussians only; use backend="auto"'):
-        gsplat.check(RasterJob(flat(random_scene(5)), False, RasterSettings(), torch.float32))

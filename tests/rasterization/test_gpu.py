@@ -1,15 +1,18 @@
 """The GPU backends: what they refuse, and, where there is a GPU, that they agree."""
 
+import threading
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
-from normlift_ns import Camera, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine, render
+from normlift_ns import Camera, InputError, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine, render
 from normlift_ns.core import device
-from normlift_ns.rasterization import gsplat, triton
+from normlift_ns.rasterization import gsplat, rasterize, triton
 from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
 from tests.captures import SHARED, fixture_view, needs_shared, trained_scene, training_cameras, weight_fixtures
 from tests.kernels.test_regions import hard_scene
@@ -48,41 +51,61 @@ def job(scene, **constants):
     return RasterJob(scene, False, RasterSettings(**constants), torch.float32)
 
 
-class OnGpu:
-    means = torch.zeros(1, 3, device="meta")
-    primitive = "3dgs"
-
-
-@pytest.fixture
-def on_gpu(monkeypatch, unchecked):
-    scene = OnGpu()
-    monkeypatch.setattr(type(scene.means), "device", torch.device("cuda"), raising=False)
-    return scene
-
-
-def test_gsplat_draws_what_its_compiled_code_can(on_gpu, monkeypatch):
-    gsplat.check(job(on_gpu, eps2d=0.1))
-    with pytest.raises(ValueError, match=r"max_alpha"):
-        gsplat.check(job(on_gpu, max_alpha=0.99))
-    triton.check(job(on_gpu, max_alpha=0.99, tile_size=32))
+def test_gpu_backends_draw_what_their_kernels_can(monkeypatch):
+    for backend in (gsplat, triton):
+        monkeypatch.setattr(backend, "check_gpu", lambda *_: None)
+    scene = random_scene(5, dtype=torch.float32)
+    gsplat.check(job(scene, eps2d=0.1))
+    with pytest.raises(ValueError, match=r'3D Gaussians only; use backend="auto"'):
+        gsplat.check(job(replace(scene, primitive="2dgs")))
+    triton.check(job(scene, max_alpha=0.99, tile_size=32))
     with pytest.raises(ValueError, match=r"tile_size .*power of two.* 20;"):
-        triton.check(job(on_gpu, tile_size=20))
+        triton.check(job(scene, tile_size=20))
     for installed, rules, changed in (
         ("1.4.0", "1.4", None),
         ("1.4.0", "1.5", "per_axis, radius_sigmas"),
         ("1.5.3", "1.4", None),
-        ("1.5.3", "1.5", None),
         ("1.5.3", "1.6", "min_compensation, max_alpha"),
         ("1.6.0", "1.4", "min_compensation, max_alpha"),
         ("1.6.0", "1.6", None),
     ):
         monkeypatch.setattr(gsplat, "installed_gsplat_version", lambda installed=installed: installed)
-        wanted = RasterJob(on_gpu, False, RasterSettings.of_gsplat(rules), torch.float32)
+        wanted = RasterJob(scene, False, RasterSettings.of_gsplat(rules), torch.float32)
         if changed is None:
             gsplat.check(wanted)
         else:
             with pytest.raises(ValueError, match=rf'gsplat {installed} .* {changed} .*"triton"'):
                 gsplat.check(wanted)
+
+
+def test_before_triton_3_a_gpu_rasterizes_with_stock_gsplat(monkeypatch):
+    """A Triton without version is taken."""
+    means = SimpleNamespace(device=torch.device("cuda"), is_cuda=True, dtype=torch.float32)
+    on_gpu: Any = SimpleNamespace(scene=SimpleNamespace(means=means), dtype=torch.float32)
+    monkeypatch.setattr(rasterize, "has_triton", device.has_triton.__wrapped__)
+    for installed, taken in (("3.0.0", True), ("3.6.0", True), ("", True), ("2.3.1", False), (None, False)):
+
+        def version(name, installed=installed):
+            if not installed:
+                raise PackageNotFoundError(name)
+            return installed
+
+        monkeypatch.setattr(device, "version", version)
+        monkeypatch.setattr(device, "find_spec", lambda name, found=installed is not None: found or None)
+        assert rasterize._fastest(on_gpu) == ("triton" if taken else "gsplat"), installed
+        if not taken:
+            with pytest.raises(InputError, match=r"Triton 3, .*PyTorch 2\.4"):
+                rasterize.choose_backend("triton", on_gpu)
+
+
+def test_a_gpu_that_cannot_start_is_told_of_where_it_is_wanted(monkeypatch):
+    told = []
+    monkeypatch.setattr(threading, "excepthook", told.append)
+    before = set(threading.enumerate())
+    device.init_cuda("cuda:99")
+    for thread in set(threading.enumerate()) - before:
+        thread.join()
+    assert told == []
 
 
 def test_views_in_flight_are_as_many_as_short_numbers_and_memory_hold():
@@ -102,25 +125,6 @@ def test_a_missing_or_unknown_gsplat_is_said(monkeypatch):
         with pytest.raises(ValueError, match=told):
             gsplat.installed_settings()
     gsplat.installed_gsplat_version.cache_clear()
-
-
-def test_a_full_gpu_is_answered_by_smaller_parts():
-    asked = []
-
-    def run(items):
-        asked.append(len(items))
-        if len(items) > 2:
-            raise torch.cuda.OutOfMemoryError("no room")
-        return sum(items)
-
-    assert device.retry_in_halves(run, [1, 2, 3, 4, 5], "buy memory") == [3, 3, 9]
-    assert asked == [5, 2, 3, 1, 2]
-
-    def never(items):
-        raise torch.cuda.OutOfMemoryError("no room")
-
-    with pytest.raises(MemoryError, match=r"memory is full \(no room\); buy memory"):
-        device.retry_in_halves(never, [1, 2], "buy memory")
 
 
 @needs_gpu
@@ -244,12 +248,10 @@ def test_the_whole_lift_equals_that_of_the_cpu():
 
 @needs_gpu
 def test_neighbours_that_the_kernel_is_not_sure_of_come_from_the_cpu():
-    points = torch.cartesian_prod(*[torch.arange(9.0)] * 3)
-    points[5] = torch.nan
-    found, expected = nearest_neighbors(points.cuda(), 12), nearest_neighbors(points, 12)
-    assert torch.equal(found.index.cpu(), expected.index)
+    lattice = torch.cartesian_prod(*[torch.arange(9.0)] * 3)
     uneven = torch.randn(50_000, 3, generator=generator(0)) ** 5
-    uneven[17] = torch.inf
-    found, expected = nearest_neighbors(uneven.cuda(), 36), nearest_neighbors(uneven, 36)
-    assert torch.equal(found.index.cpu(), expected.index)
-    assert torch.allclose(found.spacing.cpu(), expected.spacing, rtol=1e-15, atol=0)
+    lattice[5], uneven[17] = torch.nan, torch.inf
+    for points in (lattice, uneven):
+        found, expected = nearest_neighbors(points.cuda(), 36), nearest_neighbors(points, 36)
+        assert torch.equal(found.index.cpu(), expected.index)
+        assert torch.allclose(found.spacing.cpu(), expected.spacing, rtol=1e-15, atol=0)

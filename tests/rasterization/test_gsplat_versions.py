@@ -28,31 +28,34 @@ def telling_scene() -> GaussianScene:
     return scene
 
 
-WIDTH, HEIGHT = 50, 41
-
-
 def drawn_by(rules: str, antialiased: bool):
-    """What must come of the telling scene: its weights, labels of four regions, and the evidence of these."""
-    scene, (camera,) = telling_scene(), orbit(1, width=WIDTH, height=HEIGHT)
+    """What must come of the telling scene: its weights, labels of four regions, and the evidence of all powers of the
+    weights: pixels without a label, then the regions.
+    """
+    scene, (camera,) = telling_scene(), orbit(1, width=50, height=41)
     weights = torch.from_numpy(compositing_matrix(scene, camera, antialiased, rules))
     labels = random_labels(camera, 4, seed=1)
-    expected = torch.stack([(weights * (labels == region)[:, :, None]).sum((0, 1)) for region in range(4)], 1)
-    return scene, camera, labels, weights, expected
+    powers = [torch.where(weights > 0, weights**power, 0) for power in (0, 1, 2)]  # 0: the pixels it contributes to
+    there = [(labels == region)[:, :, None] for region in range(-1, 4)]
+    return scene, camera, labels, weights, [torch.stack([(x * y).sum((0, 1)) for y in there], 1) for x in powers]
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_every_backend_draws_by_the_rules_and_these_differ(antialiased):
-    found = []
+    found, values = [], torch.rand(18, 3, generator=generator(0), dtype=torch.float64)
     for rules in GSPLAT_VERSIONS:
-        scene, camera, labels, weights, expected = drawn_by(rules, antialiased)
+        scene, camera, labels, weights, sums = drawn_by(rules, antialiased)
         found.append(weights)
         for backend in ("torch", "numba"):
             mode = "antialiased" if antialiased else "classic"
             how = {"backend": backend, "rasterize_mode": mode, "settings": RasterSettings.of_gsplat(rules)}
-            evidence = rasterize_evidence(scene, [camera], [labels], num_regions=[4], **how)
-            assert (dense(evidence.rows, 4) - expected).abs().max() < 1e-9, (rules, backend)
-            _, alpha = render(scene, camera, torch.ones(18, 1, dtype=torch.float64), **how)
-            assert (alpha - weights.sum(2)).abs().max() < 1e-9, (rules, backend)
+            for power, expected in enumerate(sums):
+                evidence = rasterize_evidence(scene, [camera], [labels], num_regions=[4], weight_power=power, **how)
+                both = torch.cat([dense(evidence.unlabeled, 1), dense(evidence.rows, 4)], 1)
+                assert (both - expected).abs().max() < 1e-12 * expected.max(), (rules, backend, power)
+            image, alpha = render(scene, camera, values, **how)
+            assert (image - weights @ values).abs().max() < 1e-12, (rules, backend)
+            assert (alpha - weights.sum(2)).abs().max() < 1e-12, (rules, backend)
     first, second, third = found
     assert (first - second).abs().max() > 1e-3 and (third - second).abs().max() > 1e-3
 
@@ -67,14 +70,14 @@ def test_every_backend_draws_by_the_rules_and_these_differ(antialiased):
     ],
 )
 def test_the_kernels_draw_by_the_rules(rules, antialiased):
-    scene, camera, labels, _, expected = drawn_by(rules, antialiased)
+    scene, camera, labels, _, (_, expected, _) = drawn_by(rules, antialiased)
     single = GaussianScene(*(x.float().to(DEVICE) for x in (scene.means, scene.quats, scene.scales, scene.opacities)))
     job = RasterJob(single, antialiased, RasterSettings.of_gsplat(rules), torch.float32)
     entries = triton.views_evidence(job, RasterBatch([camera], [labels.to(DEVICE)], [4]))
     found = torch.zeros(18, 5)
     found[entries.gaussian.long().cpu(), entries.column.long().cpu()] = entries.weight.cpu()
-    assert (found[:, 1:] - expected).abs().max() < 1e-3 * expected.max()
-    assert (found[:, 1:] - expected).norm() < 1e-4 * expected.norm()
+    assert (found - expected).abs().max() < 1e-3 * expected.max()
+    assert (found - expected).norm() < 1e-4 * expected.norm()
 
 
 def test_versions_have_rules(monkeypatch):

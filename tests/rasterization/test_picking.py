@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from normlift_ns import Camera, GaussianScene, render
+from normlift_ns import GaussianScene
 from normlift_ns.rasterization.rasterize import ray_weights
-from tests.random_scenes import generator, random_scene
+from tests.random_scenes import random_scene
 
 
 def scene(*rows: tuple[float, float, float, float]) -> GaussianScene:
@@ -50,23 +50,3 @@ def test_flat_gaussians_and_broken_ones_give_numbers():
     assert found.isfinite().all()
     assert found[20] == found[21] == 0
     assert 0 < float(found.sum()) <= 1
-
-
-def test_it_agrees_with_the_rendered_image():
-    """A pixel in the middle of a large image of small blur: the same Gaussian weighs most in nearly all of them."""
-    world = random_scene(120, seed=5, size=0.3)
-    pose = torch.eye(4).double()
-    pose[2, 3] = 5
-    size, agree = 200, 0
-    K = torch.tensor([[200.0, 0, 100], [0, 200, 100], [0, 0, 1]]).double()
-    image, _ = render(world, Camera(K, pose, size, size), torch.eye(120).double())
-    places = torch.randint(50, 150, (60, 2), generator=generator(1))
-    for x, y in places.tolist():
-        ray = torch.tensor([(x + 0.5 - 100) / 200, (y + 0.5 - 100) / 200, 1]).double()
-        weights = ray_weights(world, torch.tensor([0.0, 0, -5]).double(), ray)
-        seen = image[y, x]
-        if float(seen.max()) < 0.05:
-            continue
-        agree += int(weights.argmax()) == int(seen.argmax())
-        assert abs(float(weights.sum()) - float(seen.sum())) < 0.25
-    assert agree >= 40
