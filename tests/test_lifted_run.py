@@ -172,18 +172,14 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
         ({"features": [(labels + 1, vectors)] * 12}, r"images/0000\.png .* -1\.\.1, .* 1\.\.2"),
         ({"features": [(labels, torch.nan * vectors)] * 12}, r"images/0000\.png must be finite"),
         ({"features": [*[half] * 11, (labels, torch.eye(3))]}, r"\[2, 3\]"),
-        ({"features": []}, " 12.* 0;"),
         ({"features": {}}, "empty"),
         ({"features": [labels.numpy()] * 12}, "must be a tuple of 2"),
         ({"features": [(labels * 0.5, vectors)] * 12}, "integers, got float32"),
         ({"texts": {"a": np.zeros(2)}}, r"'a' must be finite, not zero and of shape \[D\]"),
-        ({"texts": {"a": [1.0, float("nan")]}}, "'a' must be finite"),
         ({"texts": {"a": np.ones((1, 2))}}, r"texts\['a'\] must be"),
-        ({"texts": {" ": [1, 2]}}, "' ' in texts is not"),
         ({"texts": {"fox.npy": [1, 2]}}, "'fox.npy' in texts is not"),
         ({"texts": {5: [1, 2]}}, "dictionary"),
         ({"texts": {"a": ["x", "y"]}}, "numbers"),
-        ({"texts": {"a": [1j, 2]}}, "must be an array of floating-point"),
         ({"texts": {"a": [1, 2, 3]}}, r"\[2, 3\]"),
         ({"texts": {"a": [1, 2]}, "queries": ["b"]}, "'b' .*such as a"),
         ({"queries": ["b"]}, "is empty"),
@@ -191,9 +187,8 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
         ({"features": None, "texts": {"a": [1, 2]}, "source": nl.SourceOptions(encoder="color")}, "texts"),
         ({"source": nl.SourceOptions(encoder="color")}, "source"),
         ({"load_step": 3}, "open_scene"),
-        *(({name: 5}, name) for name in ("source", "lift", "timestamp", "overwrite", "check", "export", "features")),
-        ({"output_dir": 5}, "output_dir"),
-        *(({"timestamp": x}, "folder name") for x in (".", "..", "a/b", "/x", "", ".cache", "x\ny", "\x1b[31m")),
+        *(({name: 5}, name) for name in ("source", "timestamp", "check", "export", "features")),
+        *(({"timestamp": x}, "folder name") for x in ("..", "a/b", "", ".cache", "x\ny")),
         ({"timestamp": "a" * 300}, "300 .* 200"),
     ]
     for arguments, message in wrong:
@@ -224,13 +219,8 @@ def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_pat
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         nl.open_run(lifted, data=room)  # a copy has the same cameras
-    for change, changed in (
-        ("focal", "training and held-out"),
-        ("order", "training"),
-        ("poses", "training and held-out"),
-        ("one pose", "training and held-out"),
-        ("held out", "held-out"),
-    ):
+    both = "training and held-out"
+    for change, changed in (("focal", both), ("order", "training"), ("one pose", both), ("held out", "held-out")):
         content = json.loads(whole)
         frames = content["frames"]
         if change == "focal":
@@ -240,8 +230,7 @@ def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_pat
             (first, second), key = frames[1:3] if change == "order" else held_out[:2], "transform_matrix"
             first[key], second[key] = second[key], first[key]
         else:
-            for frame in frames[1 : 2 if change == "one pose" else None]:
-                frame["transform_matrix"][0][3] += 4e-4
+            frames[1]["transform_matrix"][0][3] += 4e-4
         file.write_text(json.dumps(content))
         with pytest.warns(UserWarning, match=f"the {changed} cameras"):
             nl.open_run(lifted, data=room)
@@ -253,13 +242,9 @@ def test_wrong_kinds_are_named(run: nl.LiftedRun, tmp_path: Path) -> None:
     assert answer != run.ask("red") and len(repr(answer)) < 200 and len(repr(run)) < 300
     with pytest.raises(ValueError, match="each of \\*texts"):
         run.ask(["red", "blue"])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"negatives must be a list .*\['blue'\]"):
-        run.ask("red", negatives="blue")
-    with pytest.raises(nl.InputError, match="min_reliability"):
-        run.ask("red", min_reliability=5.0)
     with pytest.raises(nl.InputError, match="valid characters"):
         run.ask("red\0")
-    for part in (answer.mask[:-1], answer.mask.int(), [1, 2], "x", {}, object(), [[1], 2]):
+    for part in (answer.mask[:-1], answer.mask.int(), "x", [[1], 2]):
         with pytest.raises(ValueError, match="part must be"):
             run.export(tmp_path / "new" / "a.ply", part)
     with pytest.raises(nl.InputError, match="valid file name"):

@@ -1,7 +1,5 @@
 """Votes for a selection against sums in float64, and identities that they keep."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from normlift_ns import Evidence, InputError
-from normlift_ns.analysis.explain import RecordedVotes, Why, draw_outlines, explain_selection
+from normlift_ns.analysis.explain import Why, draw_outlines, explain_selection
 from normlift_ns.core.evidence import Entries
 from tests.examples import examples
 from tests.random_scenes import generator, unit_rows
@@ -91,15 +89,6 @@ def test_unlabelled_pixels_dilute_where_they_did_in_the_lift():
     assert diluted.c_inter == pytest.approx(plain.c_inter, abs=1e-6)
 
 
-def test_photographs_that_agree_have_nothing_different():
-    entries = Entries(torch.tensor([0, 0]), torch.tensor([1, 3]), torch.tensor([0.3, 0.7]), (1, 1))
-    same = torch.tensor([[0.6, 0.8], [0.6, 0.8]])
-    why = explain_selection(Evidence.from_entries([entries], 1), same, torch.ones(1, dtype=torch.bool))
-    assert why.most_different == ()
-    assert why.c_inter == pytest.approx(1)
-    assert why.to_json()["views"][0]["regions"][0]["weight"] == pytest.approx(0.7)
-
-
 def test_agreement_in_words():
     def level(c_inter: float) -> str:
         words = Why(1, 0, 0.5, 0.5, c_inter, 5.04, 0.5, ()).words
@@ -115,6 +104,8 @@ def test_agreement_in_words():
     evidence = Evidence.from_entries([entries], 1)
     alone = explain_selection(evidence, torch.tensor([[0.6, 0.8], [1.0, 0.0]]), torch.ones(1, dtype=torch.bool))
     assert "one image" in alone.words and "1.00" not in alone.words  # it agrees with nobody
+    assert alone.most_different == () and alone.c_inter == pytest.approx(1)
+    assert alone.to_json()["views"][0]["regions"][0]["weight"] == pytest.approx(0.7)
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -127,14 +118,6 @@ def test_selections_of_nothing_or_of_another_shape():
     ):
         with pytest.raises(InputError, match=hint):
             explain_selection(evidence, features, wrong)
-
-
-def test_without_cached_evidence_no_regions_are_computed(tmp_path):
-    field = SimpleNamespace(store=None, manifest={"views_lifted": []})
-    votes = RecordedVotes(None, field, tmp_path)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="evidence"):
-        _ = votes.table
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_outline_lies_within_and_around_its_region():

@@ -78,6 +78,7 @@ def test_what_the_cache_no_longer_holds_is_named(run: nl.LiftedRun, tmp_path: Pa
         return
     with pytest.raises(nl.InputError, match=r"emptied/evidence .*ns-normlift"):
         votes.explain(mask)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_photographs_that_are_gone_replaced_or_unknown_are_named(run, trained: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns import Evidence, RefineConfig, consensus, lift, nearest_neighbors
+from normlift_ns import Evidence, RefineConfig, consensus, lift
 from normlift_ns.core import partition
 from normlift_ns.core.field import SemanticField
 from normlift_ns.core.lift import Scalars
@@ -127,15 +127,6 @@ def test_the_field_is_the_same(vote: str, storage: Storage, seed: int) -> None:
             assert torch.equal(getattr(found.scalars, field.name), getattr(expected.scalars, field.name)), field.name
         for a, b in zip(stored(found), stored(expected)):
             assert torch.equal(a, b)
-
-
-def test_neighbours_of_some_are_those_of_all() -> None:
-    means, _, _ = world(4)
-    every = nearest_neighbors(means, 9)
-    some = torch.randperm(N, generator=generator(0))[:40]
-    for a, b in zip(nearest_neighbors(means, 9, of=some), every):
-        assert torch.equal(a, b[some])
-    assert len(nearest_neighbors(means, 9, of=some[:0]).index) == 0
 
 
 def test_process_0_reports_the_views_of_all() -> None:

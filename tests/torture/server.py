@@ -20,7 +20,6 @@ import torch
 from normlift_ns.cli import export, lift, query
 from normlift_ns.demo.capture import write_capture, write_splatfacto_run
 from tests.plain_room import plain_room
-from tests.torture import flips
 
 _WRITE = os.O_WRONLY | os.O_RDWR
 _CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.chmod", "shutil.rmtree"}
@@ -31,7 +30,7 @@ class Job:
     """A command, and when it is to be killed."""
 
     words: tuple[str, ...]
-    """`lift`, `query` or `export` with flags; `room` or `flips` with folders."""
+    """`lift`, `query` or `export` with flags; `room` with a folder."""
     log: str
     """File of all that it prints."""
     folder: str = ""
@@ -53,9 +52,6 @@ def work(words: tuple[str, ...]) -> int:
     name, *flags = words
     if name == "room":
         make_room(Path(flags[0]))
-        return 0
-    if name == "flips":
-        flips.main(Path(flags[0]), int(flags[1]), int(flags[2]), Path(flags[3]))
         return 0
     sys.argv = [name, *flags]
     try:
