@@ -48,12 +48,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if "research" in item.path.parts:
             item.add_marker("extra")
     if "PYTEST_XDIST_WORKER" in os.environ:
-        needs = {name: {x.path for x in items if name in _fixtures(x)} for name in ("nerfstudio", "made_once")}
+        names = ("nerfstudio", "made_once")
+        needs = {name: {x.path for x in items if name in getattr(x, "fixturenames", [])} for name in names}
         items.sort(key=lambda item: [item.path not in paths for paths in needs.values()])
-
-
-def _fixtures(item: pytest.Item) -> list[str]:
-    return getattr(item, "fixturenames", [])
 
 
 def pytest_collection_finish() -> None:

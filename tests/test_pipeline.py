@@ -15,13 +15,10 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import normlift_ns as nl
 from normlift_ns.core.consensus import consensus
-from normlift_ns.data.frames import Frame, Intrinsics
-from normlift_ns.data.images import ImageViews
-from normlift_ns.encoders.base import FeatureSource, RegionFeatures, ViewFeatures, precomputed_features
+from normlift_ns.encoders.base import RegionFeatures, ViewFeatures, precomputed_features
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.encoders.langsplat import FeatureExport, LangSplat
 from normlift_ns.evaluation.lerf import run_lerf
@@ -53,9 +50,8 @@ def scene(*names: str, count: int = N, held_out: Sequence[str] = (), mask: Any =
     return made_scene(gaussians, train, other)
 
 
-def lifted(source: FeatureSource, cache: Path, made: Any = None, **options: Any) -> Any:
-    export = options.pop("export", None)
-    given = nl.LiftOptions(refine=False, **{"storage": "evidence", **options})
+def lifted(source: Any, cache: Path, made: Any = None, export: Any = None, **options: Any) -> Any:
+    given = nl.LiftOptions(**{"refine": False, "storage": "evidence", **options})
     return lift_scene(scene() if made is None else made, source, given, cache, encoder={}, export=export)
 
 
@@ -70,11 +66,9 @@ FULL = np.ones((HEIGHT, WIDTH), int)
 
 
 def test_nothing_labelled_is_refused_and_few_gaussians_with_features_are_warned_of(tmp_path: Path) -> None:
-    for value in (0, -1, -5):
-        for unlabeled in ("ignore", "dilute"):
-            source = files(tmp_path / "maps", value * FULL)
-            with pytest.raises(nl.InputError, match=r"nothing was labeled: .* 30 .*maps.*--regions-back"):
-                lifted(source, tmp_path / "cache", unlabeled=unlabeled)
+    for value, unlabeled in ((0, "ignore"), (-5, "dilute")):
+        with pytest.raises(nl.InputError, match=r"nothing was labeled: .* 30 .*maps.*--regions-back"):
+            lifted(files(tmp_path / "maps", value * FULL), tmp_path / "cache", unlabeled=unlabeled)
     hidden, away = scene(mask=torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)), scene()
     away.gaussians.means[:] -= 100
     for made, why in ((hidden, "masks"), (away, "cameras")):
@@ -127,7 +121,6 @@ def test_maps_of_distorted_images_are_refused_or_stretched(tmp_path: Path) -> No
     for height, width, what in (
         (HEIGHT + 1, WIDTH + 1, "the size of the original image"),
         (HEIGHT // 2, WIDTH // 2, "a different size"),
-        (2 * HEIGHT + 2, 2 * WIDTH + 2, "a different size"),
     ):
         for kind in ("langsplat", "files"):
             refused, stretched = (
@@ -141,12 +134,6 @@ def test_maps_of_distorted_images_are_refused_or_stretched(tmp_path: Path) -> No
                 lifted(refused, tmp_path / "cache", scene(original=RAW))
             with pytest.warns(UserWarning, match=message + ".*resized"):
                 lifted(stretched, tmp_path / "cache", scene(original=RAW))
-    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
-    for k1, original, size in ((0.0, None, (40, 30)), (0.01, (40, 30), (39, 29))):
-        intrinsics = Intrinsics(40.0, 40.0, 20.0, 15.0, 40, 30, k1)
-        view = ImageViews([Frame(tmp_path / "a.png", "a.png", np.eye(4)[:3], intrinsics)], torch.zeros(3))[0]
-        assert view.original == original
-        assert (view.camera.width, view.camera.height) == size
 
 
 def test_maps_of_undistorted_images_are_taken(tmp_path: Path) -> None:
@@ -193,15 +180,12 @@ def test_names_of_pictures_lose_no_camera_and_guess_none() -> None:
         (["0.png", "0.jpg"], ["0.png", "0.jpg"]),
         (["a/b_0.png", "a_b/0.png", "c/0.png"], ["b_0", "a_b_0", "c_0"]),
         (["a/b/0.png", "a_b/0.png"], ["a_b_0.png", "a_b_0_2.png"]),
-        (["a/X.png", "b/x.png"], ["a_X", "b_x"]),
-        (["/data/a/0.png", "../b/0.png"], ["_data_a_0", ".._b_0"]),
+        (["/data/a/X.png", "../b/x.png"], ["_data_a_X", ".._b_x"]),
     ):
         assert unique_file_names(images) == expected
     made = scene("a/0000.png", "b/0000.png", "b/0001.png")
     assert list(training_cameras(made)) == ["a_0000", "b_0000", "0001"]
-    for name in ("b_0000", "b/0000", "b/0000.png"):
-        assert list(training_cameras(made, [name])) == ["b_0000"]
-    assert list(training_cameras(made, ["0001", "a_0000"])) == ["0001", "a_0000"]
+    assert list(training_cameras(made, ["0001", "b/0000", "a/0000.png"])) == ["0001", "b_0000", "a_0000"]
     for name, message in (("0000", "2 .*'0000'.* a_0000, b_0000"), ("c", "'c'.* 3 names from 'a_0000' to '0001'")):
         with pytest.raises(nl.InputError, match=message):
             training_cameras(made, [name])
@@ -286,18 +270,12 @@ def halves(folder: Path) -> RegionFeatures:
 def test_consensus_changes_features_and_nothing_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The three views have two masks each, of noise of their own; switching it on rasterizes nothing again, and the
     stored features are those that the formula gives."""
-    source = halves(tmp_path / "maps")
-    told: list[str] = []
-    results = []
+    source, results = halves(tmp_path / "maps"), []
     for on in (False, True, False):
-        given = nl.LiftOptions(refine=False, consensus=on, consensus_sample=7, storage="evidence")
-        how: Any = {"encoder": {}, "report": lambda stage, *_: told.append(stage)}
-        results.append(lift_scene(scene(*THREE), source, given, tmp_path / "cache", **how))
+        results.append(lifted(source, tmp_path / "cache", scene(*THREE), consensus=on, consensus_sample=7))
         monkeypatch.setattr(nl.evidence_collection, "rasterize_evidence", None)
-    assert "consensus" in told
     _, on, off = results
     assert "consensus" not in off.seconds and "consensus" not in off.field.manifest["statistics"]
-    assert list(on.seconds).index("consensus") == list(on.seconds).index("evidence") + 1
     facts = on.field.manifest["statistics"]["consensus"]
     assert {name: facts[name] for name in ("power", "sample", "seed")} == {"power": 1.0, "sample": 7, "seed": 0}
     assert facts["agreement"][0] > 0.5
@@ -319,10 +297,8 @@ def test_the_vote_counts_what_was_seen_before_the_consensus(monkeypatch: pytest.
     run takes the same numbers."""
     source, watched = halves(tmp_path / "maps"), MagicMock(side_effect=nl.pipeline.refine)
     monkeypatch.setattr(nl.pipeline, "refine", watched)
-    fields = []
-    for on in (False, True):
-        options = nl.LiftOptions(consensus=on, reliability_beta=0.7, vote=nl.RefineConfig(vote="posterior", k=3))
-        fields.append(lift_scene(scene(*THREE), source, options, tmp_path / "cache", encoder={}).field)
+    how = {"refine": True, "reliability_beta": 0.7, "vote": nl.RefineConfig(vote="posterior", k=3)}
+    fields = [lifted(source, tmp_path, scene(*THREE), consensus=on, **how).field for on in (False, True)]
     first, second = watched.call_args_list
     assert torch.equal(first.args[2], second.args[2]) and torch.equal(first.kwargs["own"], second.kwargs["own"])
     plain, agreed = (voting_scalars(field) for field in fields)
@@ -338,9 +314,8 @@ def test_the_gate_is_measured_after_a_consensus_and_fixed_by_options(
     monkeypatch.setattr(nl.pipeline, "refine", watched)
 
     def voted(**options: Any) -> tuple[Any, nl.RefineConfig]:
-        given = nl.LiftOptions(**{"consensus": True, "vote": nl.RefineConfig(k=5), **options})
-        field = lift_scene(scene(*THREE, count=300), source, given, tmp_path / "cache", encoder={}).field
-        return field.manifest, watched.call_args.args[3]
+        how = {"refine": True, "consensus": True, "vote": nl.RefineConfig(k=5), **options}
+        return lifted(source, tmp_path, scene(*THREE, count=300), **how).field.manifest, watched.call_args.args[3]
 
     manifest, config = voted()
     statistics, vote = manifest["statistics"], manifest["options"]["vote"]
@@ -352,11 +327,8 @@ def test_the_gate_is_measured_after_a_consensus_and_fixed_by_options(
     manifest, config = voted(vote=nl.RefineConfig(k=5, tau=0.9, gamma=0.05, min_labeled=0.0), recognition=False)
     assert config.numbers == VOTE_DEFAULTS["posterior"]._replace(min_labeled=0.0)  # version 0.2
     assert {"gate", "recognition"}.isdisjoint(manifest["statistics"])
-    for options in (
-        {"consensus": False},
-        {"consensus_min_agreement": 1.0},
-        {"vote": nl.RefineConfig(vote="paper", k=5)},
-    ):
+    paper = {"vote": nl.RefineConfig(vote="paper", k=5)}
+    for options in ({"consensus": False}, {"consensus_min_agreement": 1.0}, paper):
         manifest, config = voted(**options)
         assert "gate" not in manifest["statistics"] and config.numbers == VOTE_DEFAULTS[config.vote]
 
@@ -369,13 +341,14 @@ def test_regions_that_are_objects_need_no_agreement(tmp_path: Path) -> None:
 
 
 def test_reliabilities_of_pairs_of_views_are_stored_and_leave_the_vote_alone(tmp_path: Path) -> None:
-    source, fields = halves(tmp_path / "maps"), {}
-    for kind in ("paper", "pairs", "angular"):
-        options = nl.LiftOptions(reliability=kind, vote=nl.RefineConfig(k=3))
-        fields[kind] = lift_scene(scene(*THREE), source, options, tmp_path / "cache", encoder={}).field
-    paper, pairs, angular = (field.scalars.reliability for field in fields.values())
+    how = {"refine": True, "vote": nl.RefineConfig(k=3)}
+    fields = [
+        lifted(halves(tmp_path / "maps"), tmp_path, scene(*THREE), reliability=kind, **how).field
+        for kind in ("paper", "pairs", "angular")
+    ]
+    paper, pairs, angular = (field.scalars.reliability for field in fields)
     seen = paper > 0
-    assert torch.equal(fields["paper"].source, fields["angular"].source)
+    assert torch.equal(fields[0].source, fields[2].source)
     assert bool((pairs[seen] < paper[seen]).all() and (pairs[seen] > 0).all())
     assert bool((angular[seen] <= 0.021).all())  # all three cameras are at one place
 
@@ -397,8 +370,7 @@ def test_levels_agree_each_for_itself(tmp_path: Path) -> None:
             own = rows[[0, 1, 2]] if name == "a.png" else rows[[2, 1, 0]]
             return ViewFeatures(cells, own, torch.tensor([[0, 0], [1, 2]], dtype=torch.int32))
 
-    given = nl.LiftOptions(refine=False, consensus=True, storage="evidence")
-    found = lift_scene(scene("a.png", "b.png"), Both(), given, tmp_path, encoder={}).field
+    found = lifted(Both(), tmp_path, scene("a.png", "b.png"), consensus=True).field
     assert len(found.manifest["statistics"]["consensus"]["agreement"]) == 2
     whole = torch.nn.functional.normalize(rows[0] + rows[2], dim=0)
     assert torch.allclose(found.store.features[[0, 3]], whole.expand(2, -1), atol=1e-6)

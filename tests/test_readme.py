@@ -32,17 +32,11 @@ PAGE_NAMES = ("front_ends", "splats", "scale", "check", "viewer", "objects", "in
 PAGE_NAMES = (*PAGE_NAMES, "honest_answers", "python", "../README")
 TERMINAL = {"--quiet", "--log-file", "--version", "--help"}
 OTHERS = {"--app_opt", "--auto-scale-poses", "--center-method", "--csv", "--eval", "--filter-value", "--no-deps"}
-OTHERS |= {
-    "--normalize-world-space",
-    "--no-normalize-world-space",
-    "--orientation-method",
-    "--white_background",
-    "--xml",
-}
-OTHERS |= {"--pose_opt", "--rendered-output-names", "--clip", "--scenes", "--texts", "--later", "--viewer"}
-OTHERS |= {"--no-python", "--nnodes", "--nproc-per-node", "--rdzv-backend", "--rdzv-endpoint"}  # torchrun
-OTHERS |= {"--keep-crs", "--torch-backend"}  # OpenSplat, uv
-"""Of other programs: pip, uv, ns-train, gsplat's trainer, our benchmarks, and so on."""
+OTHERS |= {"--normalize-world-space", "--no-normalize-world-space", "--orientation-method", "--white_background"}
+OTHERS |= {"--xml", "--pose_opt", "--rendered-output-names", "--clip", "--scenes", "--texts", "--later", "--viewer"}
+OTHERS |= {"--no-python", "--nnodes", "--nproc-per-node", "--rdzv-backend", "--rdzv-endpoint"}
+OTHERS |= {"--keep-crs", "--torch-backend"}
+"""Of other programs: pip, uv, torchrun, OpenSplat, ns-train, gsplat's trainer, our benchmarks, and so on."""
 
 
 def python_of(text: str) -> list[str]:

@@ -1,15 +1,12 @@
 """The benchmarks run and report what they promise, and the errors beside the times are small."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 
-from normlift_ns import Evidence, lift
-from normlift_ns.core.evidence import Entries
+from normlift_ns import lift
 from normlift_ns.core.metrics import class_scores, classify, confusion
-from normlift_ns.core.sparse import SparseRows
 from research.coverage import Outcome, Sums
 from research.damage import Observed
 from research.documents import documents
@@ -18,6 +15,7 @@ from research.numerics import CASES, main
 from research.tests import quick
 from research.variants import lifted_scores
 from tests.captures import needs_shared
+from tests.random_scenes import generator, random_evidence, unit_rows
 
 
 @needs_shared
@@ -46,36 +44,17 @@ def test_quick_front_ends_benchmark(tmp_path):
         assert metrics[key]["error"] <= most, key
 
 
-GAUSSIANS, VIEWS, REGIONS, CLASSES = 40, 14, 5, 3
-
-
-def observed(seed: int = 0) -> tuple[Any, Any, Observed, SparseRows]:
-    """A world without geometry: random evidence of regions, each nearly of one class."""
-    g = torch.Generator().manual_seed(seed)
-    words = torch.nn.functional.normalize(torch.randn(CLASSES, 8, generator=g), dim=1)
-    truth = torch.randint(0, CLASSES, (GAUSSIANS,), generator=g)
-    parts = []
-    for _ in range(VIEWS):
-        rows = (torch.rand(GAUSSIANS, generator=g) < 0.3).nonzero().squeeze(1)
-        column = 1 + truth[rows] + torch.randint(0, 2, (len(rows),), generator=g)
-        parts.append(Entries(rows, column, torch.rand(len(rows), generator=g), num_regions=(REGIONS,)))
-    evidence = Evidence.from_entries(parts, GAUSSIANS)
-    shown = torch.arange(VIEWS * REGIONS) % REGIONS % CLASSES
-    noise = 0.7 * torch.randn(VIEWS * REGIONS, 8, generator=g)
-    features = torch.nn.functional.normalize(words[shown] + noise, dim=1)
-    world = SimpleNamespace(truth=truth, classes=CLASSES, cameras=[None] * VIEWS)
-    seen = evidence.view_weights()
-    return world, SimpleNamespace(classes=words), Observed(evidence, features, torch.zeros(1, 0), []), seen
-
-
-@pytest.mark.parametrize("views", [[0], [1, 2, 7], list(range(VIEWS))])
+@pytest.mark.parametrize("views", [[0], [1, 2, 7], list(range(14))])
 def test_sums_answer_as_the_lift_does(views):
-    world, words, found, _ = observed()
-    evidence = found.evidence.select_views(views)
-    scores = lifted_scores(lift(evidence, found.features[found.evidence.columns_of(views)]), words.classes)
-    answer = classify(scores.cosine, scores.valid)
-    expected = 100 * class_scores(confusion(world.truth, answer, CLASSES)).miou
-    assert Sums(world, words, found, torch.arange(GAUSSIANS)).miou(views) == pytest.approx(expected)
+    """In a world without geometry: random evidence of features that are nearly those of three classes."""
+    evidence, truth = random_evidence(40, [5] * 14, 0), torch.randint(0, 3, (40,), generator=generator(1))
+    words = SimpleNamespace(classes=unit_rows(3, 8, 2))
+    features = torch.nn.functional.normalize(words.classes.repeat(24, 1)[:70] + 0.3 * unit_rows(70, 8, 3), dim=1)
+    world, found = SimpleNamespace(truth=truth, classes=3, cameras=[None] * 14), Observed(evidence, features, None, [])
+    some = evidence.select_views(views)
+    scores = lifted_scores(lift(some, features[evidence.columns_of(views)]), words.classes)
+    expected = 100 * class_scores(confusion(truth, classify(scores.cosine, scores.valid), 3)).miou
+    assert Sums(world, words, found, torch.arange(40)).miou(views) == pytest.approx(expected)
     assert 0 < expected < 100
 
 

@@ -3,19 +3,12 @@ import colorsys
 import pytest
 import torch
 
-from normlift_ns.rendering.colors import COLORMAPS, apply_colormap, colormap_rgb, named_color, prompt_colors
+from normlift_ns.rendering.colors import COLORMAPS, colormap_rgb, named_color, prompt_colors
 
 
 def test_colours_are_those_of_matplotlib() -> None:
     ends = torch.tensor([[0.267, 0.005, 0.329], [0.993, 0.906, 0.144]])
     torch.testing.assert_close(colormap_rgb(COLORMAPS[0])[[0, 255]], ends, atol=1e-3, rtol=0)  # viridis
-
-
-def test_opacity_grows_with_relevancy() -> None:
-    opacity = apply_colormap(torch.linspace(-1, 2, 301), (0.0, 1.0), colormap_rgb("viridis"))[1]
-    assert float(opacity.diff().min()) >= 0
-    assert (float(opacity[0]), float(opacity[-1])) == pytest.approx((0.35, 0.9))
-    assert float(apply_colormap(torch.zeros(1), (0.0, 1.0), colormap_rgb("viridis"), min_opacity=0.0)[1]) == 0
 
 
 def test_a_prompt_has_the_color_that_it_names_or_some_other() -> None:

@@ -112,12 +112,6 @@ def test_the_overlay_colours_the_selection_by_a_fixed_scale() -> None:
     torch.testing.assert_close(found[2:], grey[2:])
 
 
-def test_nothing_found_is_not_stretched_to_a_find() -> None:
-    assert color_scale(torch.tensor([0.1, 0.2]), 0.5) == (0.5, 0.55)
-    assert color_scale(torch.tensor([]), 0.5) == (0.5, 0.55)
-    assert color_scale(torch.tensor([0.1, 0.9]), 0.5) == (0.5, float(torch.tensor(0.9)))
-
-
 def test_segmentation_and_reliability_have_colours_of_their_own() -> None:
     rgb, grey = pictured()
     colors = prompt_colors(["a", "b", "c"])
@@ -161,7 +155,8 @@ def test_a_viewer_names_pictures_by_text_and_a_command_scalars_by_number() -> No
     assert not bool((small["overlay"] > 0.8).all(dim=2).any())  # no room for a legend
 
 
-def test_the_scale_is_that_of_all_prompts_and_views() -> None:
+def test_the_scale_is_that_of_all_prompts_and_views_and_not_stretched_to_a_find() -> None:
+    assert color_scale(torch.tensor([]), 0.5) == color_scale(torch.tensor([0.1, 0.2]), 0.5) == (0.5, 0.55)
     low = shown(("a", "b"), torch.rand(3, 2) * 0.3)
     assert make_display(low.field, low).map_scale == (0.0, pytest.approx(0.55))
     answer = shown(("a", "b"), torch.tensor([[0.9, 0.1], [0.8, 0.7], [0.2, 0.6]]))
