@@ -85,27 +85,15 @@ def test_any_number_of_regions():
         assert (expected.nnz > 0) == (labels is value)
 
 
-def test_chunks_of_tiles_change_nothing(monkeypatch):
+def test_chunks_of_tiles_change_nothing_and_keys_are_as_wide_as_they_must_be(monkeypatch):
     scene, cameras = random_scene(20, seed=2, dtype=torch.float32), orbit(1, width=21, height=17)
-    labels = [random_labels(cameras[0], 4, seed=2)]
-    whole = kernel_evidence(scene, cameras, labels, [4])
-    monkeypatch.setattr(compositing, "_MOST_SLOTS", 50)
-    parts = kernel_evidence(scene, cameras, labels, [4])
-    assert torch.equal(whole.rows.weight, parts.rows.weight)
-    assert torch.equal(whole.rows.column, parts.rows.column)
-
-
-def test_keys_are_as_wide_as_they_must_be():
-    scene, cameras = random_scene(8, seed=2, dtype=torch.float32), orbit(1, width=21, height=17)
     labels = torch.stack([random_labels(cameras[0], 4, seed=2)]).to(DEVICE)
     grid, seen, lists = triton.project_and_bin(job(scene), cameras)
-    limits = triton._limits(SETTINGS)
-    found = {
-        columns: compositing.sum_regions(
-            seen.splats, lists, labels, grid, columns=columns, limits=limits, weight_power=1
-        )
-        for columns in (5, 2**30)
-    }
-    assert (found[5].key.dtype, found[2**30].key.dtype) == (torch.int32, torch.int64)
-    assert torch.equal(found[5].weight, found[2**30].weight)
-    assert torch.equal(found[5].key // 5, (found[2**30].key // 2**30).int())
+    how = {"limits": triton._limits(SETTINGS), "weight_power": 1}
+    narrow, wide = (compositing.sum_regions(seen.splats, lists, labels, grid, columns=x, **how) for x in (5, 2**30))
+    assert (narrow.key.dtype, wide.key.dtype) == (torch.int32, torch.int64)
+    assert torch.equal(narrow.weight, wide.weight)
+    assert torch.equal(narrow.key // 5, (wide.key // 2**30).int())
+    monkeypatch.setattr(compositing, "_MOST_SLOTS", 50)
+    parts = compositing.sum_regions(seen.splats, lists, labels, grid, columns=5, **how)
+    assert torch.equal(narrow.weight, parts.weight) and torch.equal(narrow.key, parts.key)

@@ -14,10 +14,10 @@ from normlift_ns import Camera, InputError, RasterSettings, lift, nearest_neighb
 from normlift_ns.core import device
 from normlift_ns.rasterization import gsplat, rasterize, triton
 from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
-from tests.captures import SHARED, fixture_view, needs_shared, trained_scene, training_cameras, weight_fixtures
+from tests.captures import SHARED, needs_shared, trained_scene, training_cameras, weight_fixtures
 from tests.kernels.test_regions import hard_scene
 from tests.random_scenes import dense, generator, orbit, random_labels, random_scene, unit_rows
-from tests.rasterization.test_gsplat_fixtures import fixture_difference
+from tests.rasterization.test_gsplat_fixtures import weight_errors
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: the kernels cannot run")
 
@@ -197,11 +197,9 @@ def test_projection_is_that_of_gsplat_bit_for_bit(kind, mode):
 @needs_shared
 def test_weights_on_the_gpu_are_those_of_gsplat_1_4():
     for path in weight_fixtures():
-        name, _, mode = path.stem.split("_")
-        camera, labels, arrays = fixture_view(path)
-        frobenius, total = fixture_difference(trained_scene(name).to("cuda"), camera, labels, arrays, "triton", mode)
-        print(f"{path.stem}: Frobenius {frobenius:.1e}, total {total:.1e}")
-        assert frobenius <= 1e-5 and total < 1e-6, path.stem
+        scene = trained_scene(path.stem.split("_")[0]).to("cuda")
+        frobenius, _, total, _ = weight_errors(path, scene, "triton")
+        assert frobenius <= 1e-5 and total < 1e-6, f"{path.stem}: Frobenius {frobenius:.1e}, total {total:.1e}"
 
 
 @needs_gpu

@@ -1,13 +1,14 @@
 """Eight processes, or two, at once on one capture: no run is lost, and no files of two of them are mixed."""
 
 import json
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.torture.conftest import SHORT, Record, Server
-from tests.torture.test_kills import Place, differing, tree, without_cache
+from tests.torture.test_kills import Place, Tree, differing, tree, without_cache
 
 EIGHT = 2 if SHORT else 8
 TEXTS = ("red", "yellow", "blue", "green", "white", "brown", "black", "orange")[:EIGHT]
@@ -26,6 +27,17 @@ def together(place: Place, tmp_path: Path, *commands: tuple[object, ...]) -> tup
     logs = [tmp_path / f"{i}.log" for i in range(len(commands))]
     found = place.server.run(*({"words": words, "log": str(log)} for words, log in zip(commands, logs)))
     return [code for code, _ in found], [" ".join(log.read_text().split()) for log in logs]
+
+
+def each_alone(place: Place, commands: Iterable[tuple[object, ...]], look: Callable[[], Tree]) -> list[Tree]:
+    """What each of some commands leaves where nothing else happens; the place is put back as it was."""
+    known = []
+    for words in commands:
+        place.restore()
+        place.server.command(*words)
+        known.append(look())
+    place.restore()
+    return known
 
 
 def answers(place: Place, run: Path) -> Any:
@@ -68,12 +80,7 @@ def test_of_lifts_with_one_name_one_succeeds(place: Place, tmp_path: Path, recor
 def test_lifts_that_replace_one_run_leave_one_whole(place: Place, tmp_path: Path, record: Record) -> None:
     replaced = [place.lift("--timestamp", "one", "--vote-k", k, "--queries", text, "--overwrite", True)
                 for k, text in ((6, "yellow"), (9, "blue"))]  # fmt: skip
-    known = []
-    for words in replaced:
-        place.restore()
-        place.server.command(*words)
-        known.append(without_cache(tree(place.runs)))
-    place.restore()
+    known = each_alone(place, replaced, lambda: without_cache(tree(place.runs)))
     codes, logs = together(place, tmp_path, *(replaced * (EIGHT // 2)))
     assert codes == [0] * EIGHT, logs
     found = without_cache(tree(place.runs))
@@ -88,13 +95,8 @@ def export(place: Place, text: str, *flags: object) -> tuple[object, ...]:
 
 @pytest.mark.extra
 def test_exports_never_mix(place: Place, tmp_path: Path, record: Record) -> None:
-    known = []
-    for text in TEXTS[:2]:
-        place.restore()
-        place.server.command(*export(place, text))
-        known.append(tree(place.folder / "out"))
+    known = each_alone(place, (export(place, text) for text in TEXTS[:2]), lambda: tree(place.folder / "out"))
     assert known[0] != known[1]
-    place.restore()
     codes, logs = together(place, tmp_path, *(export(place, TEXTS[i % 2], "--overwrite", True) for i in range(EIGHT)))
     assert codes == [0] * EIGHT, logs
     assert tree(place.folder / "out") in known
@@ -112,25 +114,16 @@ def test_saves_and_everything_else_at_once(place: Place, tmp_path: Path, record:
     def save(text: str) -> tuple[object, ...]:
         return ("query", "--load-config", place.config, "--text", text, "--save-query", True)
 
-    known = []
-    for text in TEXTS:
-        place.restore()
-        place.server.command(*save(text))
-        known.append(tree(place.config.parent))
-    place.restore()
+    known = each_alone(place, map(save, TEXTS), lambda: tree(place.config.parent))
     codes, logs = together(place, tmp_path, *map(save, TEXTS))
     assert codes == [0] * EIGHT, logs
     assert tree(place.config.parent) in known
     place.restore()
-    mixed = [
-        *(place.lift("--vote-k", 6) for _ in range(3)),
-        *(export(place, "red", "--overwrite", True) for _ in range(3)),
-    ]
+    mixed = [place.lift("--vote-k", 6), export(place, "red", "--overwrite", True)] * 3
     codes, logs = together(place, tmp_path, *mixed, save(TEXTS[0]), save(TEXTS[1]))
     assert set(codes) == {0}, logs
     assert len(list(place.runs.glob("[!.]*"))) == 4
     assert tree(place.config.parent) in known
     assert len(tree(place.folder / "out")) == 4
-    record(
-        f"{EIGHT} saves at once; 3 lifts, 3 exports and 2 saves at once", 2 * EIGHT, "the question of one; no run lost"
-    )
+    what = f"{EIGHT} saves at once; 3 lifts, 3 exports and 2 saves at once"
+    record(what, 2 * EIGHT, "the question of one; no run lost")
