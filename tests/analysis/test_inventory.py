@@ -31,10 +31,8 @@ def scene_of_blocks(*, seam: int, cosine: float, swap: bool = False) -> torch.Te
     generator, parts = torch.Generator().manual_seed(0), []
     means = torch.stack([x, y, torch.zeros_like(x)], dim=1) + 0.01 * torch.rand(len(x), 3, generator=generator)
     for _ in range(VIEWS):
-        line, always = (
-            int(torch.randint(low, high, (), generator=generator)) for low, high in ((2, SIDE - 2), (0, 100))
-        )
-        line = SIDE // 2 if always < seam else line
+        line, draw = (int(torch.randint(*ends, (), generator=generator)) for ends in ((2, SIDE - 2), (0, 100)))
+        line = SIDE // 2 if draw < seam else line
         column = torch.where(x < SIDE // 2, 1, torch.where(y < line, 2, 3))
         parts.append(Entries(torch.arange(len(x)), column, torch.ones(len(x)), (3,)))
     rows = torch.tensor([[0, 0, 1.0], [1, 0, 0], [cosine, (1 - cosine**2) ** 0.5, 0]])

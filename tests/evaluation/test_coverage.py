@@ -159,15 +159,6 @@ def test_gains_are_those_of_a_loop(monkeypatch):
         assert sum(x for _, x in chosen[:2]) >= 0.63 * best
 
 
-def test_weights_are_shares_of_the_picture():
-    scene = wall()
-    drawn = coverage.RasterInputs(scene.gaussians, "classic", RasterSettings(), 1)
-    small, large = (coverage.view_weights(drawn, scene.train.cameras, pixels=pixels) for pixels in (1728, 10**9))
-    share = float(large.row_sums().sum())
-    assert small.row_sums().sum() == pytest.approx(share, rel=0.1)  # the blur of a pixel is wider in the small one
-    assert 0.1 < share / 8 < 1
-
-
 def test_everything_reliable_is_said():
     scene = wall(held_out=NONE)
     found = coverage.coverage_of(scene, lifted(scene, list(range(8))))
@@ -235,9 +226,13 @@ def test_new_poses_see_the_region_and_stand_where_a_camera_could_be():
     assert float(found.pictures[0].reliability[height // 2, width // 2]) < 0.2  # it looks where R is low
 
 
-def test_free_places():
+def test_free_places_and_weights_that_are_shares_of_the_picture():
     scene = wall()
     drawn = coverage.RasterInputs(scene.gaussians, "classic", RasterSettings(), 1)
+    small, large = (coverage.view_weights(drawn, scene.train.cameras, pixels=pixels) for pixels in (1728, 10**9))
+    share = float(large.row_sums().sum())
+    assert small.row_sums().sum() == pytest.approx(share, rel=0.1)  # the blur of a pixel is wider in the small one
+    assert 0.1 < share / 8 < 1
     space = coverage.free_space(drawn, scene.train.cameras[:4])
     assert space.up.tolist() == pytest.approx([0, 0, 1], abs=0.1)
     assert space.depth == pytest.approx(2.85, abs=0.1)

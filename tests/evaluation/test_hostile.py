@@ -106,6 +106,8 @@ def test_names_say_what_is_wrong(tmp_path: Path) -> None:
         (tmp_path / "labels.json").write_text(text)
         with pytest.raises(InputError, match=rf"labels\.json (?s:.*){message}"):
             read_names(tmp_path / "labels.json")
+    (tmp_path / "labels.json").write_text('{"3": "cup"}')
+    assert read_names(tmp_path / "labels.json").class_of == {3: 0}
 
 
 def test_labels_are_read_from_text_and_binary_and_absurd_headers_refused(tmp_path: Path) -> None:
@@ -142,6 +144,7 @@ def test_ids_of_another_list_are_refused_or_warned_of(tmp_path: Path) -> None:
 def test_masks_are_read_as_carefully_as_label_maps(tmp_path: Path) -> None:
     (tmp_path / "labels.json").write_text(json.dumps(NAMES))
     names = read_names(tmp_path / "labels.json")
+    assert (names.classes, names.class_of) == (("table", "mug"), {1: 0, 2: 1, 7: 0})  # equal names are one class
     masks = LabelFiles(tmp_path, description="instance mask", flag="--labels")
     for array in (np.zeros((2, 2, 3), int), np.zeros((3, 2), int)):
         np.save(tmp_path / "a.npy", array)

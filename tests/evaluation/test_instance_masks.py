@@ -9,17 +9,7 @@ import torch
 from normlift_ns import Evidence
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.evaluation.options import Evaluation, write_evaluation
-from normlift_ns.evaluation.protocols import evaluate_masks, gaussian_truth, read_names
-
-
-def test_names_join_equal_classes(tmp_path):
-    path = tmp_path / "labels.json"
-    path.write_text(json.dumps({"labels": {"1": "chair", "2": "table", "7": "chair"}, "background": 0}))
-    names = read_names(path)
-    assert names.classes == ("chair", "table")
-    assert names.class_of == {1: 0, 2: 1, 7: 0}
-    path.write_text('{"3": "cup"}')
-    assert read_names(path).class_of == {3: 0}
+from normlift_ns.evaluation.protocols import evaluate_masks, gaussian_truth
 
 
 def test_truth_needs_purity_and_weight():

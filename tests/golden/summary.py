@@ -1,8 +1,6 @@
 """A lift and its answers in few numbers, so that two versions of the program can be compared.
 
-python -m tests.golden.summary FOLDER > tests/golden/golden.json
-
-FOLDER/<scene>/ holds what `run_commands` writes. The committed golden.json was made by version 0.1.
+The committed golden.json was made by version 0.1.
 
 Another number of threads, or another kind of processor, rounds the last bits otherwise: four of 295,534 entries of the
 demo room's evidence come or go, and one Gaussian in a hundred (six on a capture) copies another of its nearly equal
@@ -16,7 +14,6 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -186,12 +183,3 @@ def differences(found: Any, golden: Any, tolerance: float, path: str = "", *, lo
     if isinstance(found, float) and isinstance(golden, float):
         return [] if abs(found - golden) <= tolerance * max(1.0, abs(golden)) else [f"{path}: {found} is not {golden}"]
     return [] if found == golden else [f"{path}: {found} is not {golden}"]
-
-
-def main(folders: Sequence[str]) -> None:
-    found = {name: summarize(Path(folders[0]) / name) for name in TEXTS}
-    print("{\n" + ",\n".join(f'"{name}": {json.dumps(summary)}' for name, summary in found.items()) + "\n}")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -18,12 +18,6 @@ def on_device(*tensors):
     return [x.to(DEVICE) for x in tensors]
 
 
-def kernel_norms(evidence, table):
-    rows = evidence.rows
-    arrays = on_device(rows.offsets, rows.column, rows.weight, evidence.region_view, table)
-    return [x.cpu() for x in sparse.row_norms(*arrays, CANCELLATION_RATIO, MANY_ENTRIES)]
-
-
 def test_segments_and_products_with_a_vector_are_added_in_float64():
     values = 10 ** (18 * torch.rand(500, generator=generator(0)) - 12)
     offsets = torch.tensor([0, 0, 1, 4, 4, 200, 500, 500])
@@ -39,14 +33,10 @@ def test_segments_and_products_with_a_vector_are_added_in_float64():
     assert torch.allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("dimension", [16, 21])
-def test_norms_equal_those_of_the_cpu(dimension):
-    evidence = random_evidence(30, [3, 0, 4, 2], 1, dtype=torch.float32)
-    table = unit_rows(9, dimension, 2, torch.float32)
-    found, expected = kernel_norms(evidence, table), _sums(evidence, table)
-    for ours, theirs in zip(found, expected):
-        assert torch.allclose(ours.double(), theirs.double(), rtol=2e-6, atol=0)
-    assert torch.equal(found[4].long(), expected[4].long())
+def kernel_norms(evidence, table, ratio=CANCELLATION_RATIO, many=MANY_ENTRIES):
+    rows = evidence.rows
+    arrays = on_device(rows.offsets, rows.column, rows.weight, evidence.region_view, table)
+    return [x.cpu() for x in sparse.row_norms(*arrays, ratio, many)]
 
 
 def test_cancelled_sums_are_right():
@@ -70,13 +60,11 @@ def test_cancelled_sums_are_right():
 
 def test_sums_of_many_entries_are_taken_in_float64():
     evidence, table = random_evidence(3, [40, 40], 8, dtype=torch.float32), unit_rows(80, 16, 2, torch.float32)
-    rows = evidence.rows
-    arrays = on_device(rows.offsets, rows.column, rows.weight, evidence.region_view, table)
-    found, exact = sparse.row_norms(*arrays, 0.0, 2), _sums(evidence, table.double())
-    for ours, theirs in zip(found, exact):
-        assert torch.allclose(ours.cpu().double(), theirs.double(), rtol=1e-12, atol=0)
-    single = sparse.row_norms(*arrays, 0.0, 1000)
-    assert (single.total.cpu() - exact[0]).abs().max() > 1e-9 * exact[0].max()
+    rows, exact = evidence.rows, _sums(evidence, table.double())
+    for ours, theirs in zip(kernel_norms(evidence, table, 0.0, 2), exact):
+        assert torch.allclose(ours.double(), theirs.double(), rtol=1e-12, atol=0)
+    single, *_ = kernel_norms(evidence, table, 0.0, 1000)
+    assert (single - exact[0]).abs().max() > 1e-9 * exact[0].max()
     arrays = on_device(torch.arange(3), rows.offsets, rows.column, rows.weight, table, torch.ones(3))
     units = sparse.unit_sums(*arrays, torch.float32, 0.0, 10).cpu()
     sums_of_rows = rows.matmul(table.double())
@@ -84,9 +72,12 @@ def test_sums_of_many_entries_are_taken_in_float64():
     assert torch.equal(units, expected.float())
 
 
-def test_directions_equal_those_of_the_cpu():
-    evidence = random_evidence(30, [3, 4], 5, dtype=torch.float32)
+def test_norms_and_directions_equal_those_of_the_cpu():
+    evidence = random_evidence(30, [3, 0, 4], 5, dtype=torch.float32)
     lifted = lift(evidence, unit_rows(7, 20, 6, torch.float32))
+    expected = _sums(evidence, lifted.features)
+    for ours, theirs in zip(kernel_norms(evidence, lifted.features), expected):
+        assert torch.allclose(ours.double(), theirs.double(), rtol=2e-6, atol=0)
     rows = torch.randperm(30, generator=generator(7))
     given = evidence.rows
     arrays = on_device(rows, given.offsets, given.column, given.weight, lifted.features, lifted.scalars.norm)

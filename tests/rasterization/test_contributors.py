@@ -15,10 +15,6 @@ BACKENDS = ["torch", "numba"]
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 
 
-def some_pixels(count: int, width: int, height: int, seed: int) -> torch.Tensor:
-    return (torch.rand(count, 2, generator=generator(seed)) * torch.tensor([width, height])).long()
-
-
 def matrix(found: Contributors, num_gaussians: int) -> torch.Tensor:
     pixel = torch.repeat_interleave(torch.arange(len(found.offsets) - 1), found.offsets.diff().cpu())
     full = torch.zeros(len(found.offsets) - 1, num_gaussians, dtype=torch.float64)
@@ -33,7 +29,7 @@ def matrix(found: Contributors, num_gaussians: int) -> torch.Tensor:
 def test_they_are_those_of_the_python_loops(seed, count, rules, blurred):
     scene, camera = random_scene(40, seed=seed, size=0.4), orbit_camera(seed % 7, width=37, height=21)
     scene.opacities[::3] = 0.999  # which rules cap
-    pixels = some_pixels(count, 37, 21, seed)
+    pixels = (torch.rand(count, 2, generator=generator(seed)) * torch.tensor([37, 21])).long()
     mode = "antialiased" if blurred else "classic"
     expected = torch.from_numpy(compositing_matrix(scene, camera, blurred, rules))[pixels[:, 1], pixels[:, 0]]
     depth = scene.means @ camera.world_to_camera[2, :3]
