@@ -118,6 +118,8 @@ def test_words_are_those_of_the_list_and_hold_characters_only():
     for name in ("regions", "features", "crop_fill", "features_missing"):
         for value in ("x", "", 1, None):
             refused(SourceOptions, name, value, "must be one of ")
+    for name in ("precision", "image_source", "storage", "unlabeled", "weight_power"):
+        refused(LiftOptions, name, 0 if name == "weight_power" else "x", "must be one of ")
     refused(RefineConfig, "vote", "mean", "must be one of ")
     for name in ("encoder", "encoder_model", "encoder_pretrained", "level", "prompt_template"):
         for value in ("a\0b", "a\udc80"):

@@ -132,18 +132,6 @@ def test_surface_points_are_even_and_on_the_surface_and_normals_point_outward():
         assert (inward < -0.009).mean() > 0.85, name  # not near sharp edges
 
 
-def test_cover_tiles_a_plane_with_equal_round_patches():
-    rng = np.random.default_rng(0)
-    points = np.concatenate([rng.uniform(0, 1, (24_000, 2)), np.zeros((24_000, 1))], axis=1)
-    surfels = shapes.fit_surfels(lambda p: p[:, 2], points, rng.choice(len(points), 1000, replace=False))
-    assert surfels.normals == pytest.approx(np.tile([0, 0, 1], (1000, 1)))
-    assert surfels.means[:, 2] == pytest.approx(0)
-    patch_radius = math.sqrt(1 / 1000 / math.pi)
-    assert np.median(surfels.radii) == pytest.approx(2.6 * patch_radius / 2, rel=0.1)  # a disc's deviation: radius / 2
-    assert np.quantile(surfels.radii, [0.02, 0.98]) == pytest.approx(np.median(surfels.radii), rel=0.4)
-    assert surfels.thickness == pytest.approx(1e-3)
-
-
 def test_images_and_masks_are_the_views_and_labels_name_their_values(tmp_path: Path):
     from tests.plain_room import plain_room  # noqa: PLC0415
 

@@ -76,29 +76,22 @@ def test_without_a_truth_there_are_no_accuracies():
     assert not any("accuracy" in key for key in both)
 
 
-def test_sweeps_contain_and_mark_the_default_and_the_run():
-    config = replace(RefineConfig(), k=17, tau=0.123)
-    own = studies.recorded_vote({"options": {"reliability_beta": 3.5, "vote": vars(config)}})
-    labels = [each[0].label for each in studies.sweeps([own])]
+def test_sweeps_contain_the_default_and_the_values_of_all_runs_and_mark_them():
+    config = replace(RefineConfig(), k=17, tau=0.123, sigma_d=0.77)
+    facts = ({"reliability_beta": 3.5, "vote": vars(config)}, {"vote": vars(replace(config, sigma_d=1.33))})
+    every = list(studies.sweeps([studies.recorded_vote({"options": options}) for options in facts]))
+    defaults = {"beta": studies.BETA, "k": RefineConfig().k, **RefineConfig().numbers._asdict()}
+    used = {"beta": (3.5, studies.BETA), "k": (17,), "tau": (0.123,), "sigma_d": (0.77, 1.33)}
     for parameter, values in studies.SWEEPS.items():
-        some = [label for label in labels if label["parameter"] == parameter]
-        numbers = {"beta": studies.BETA, "k": RefineConfig().k, **RefineConfig().numbers._asdict()}
-        used = {"beta": 3.5, "k": 17, "tau": 0.123}.get(parameter, numbers[parameter])
-        assert [label["value"] for label in some] == sorted({*values, numbers[parameter], used})
-        assert [label["value"] for label in some if label["default"]] == [numbers[parameter]]
-        assert [label["value"] for label in some if label["own"]] == [used]
-
-
-def test_runs_lifted_differently_are_swept_over_the_same_values():
-    owns = [
-        studies.recorded_vote({"options": {"vote": vars(replace(RefineConfig(), sigma_d=s))}}) for s in (0.77, 1.33)
-    ]
-    every = list(studies.sweeps(owns))
-    of_sigma = [each for each in every if each[0].label["parameter"] == "sigma_d"]
-    assert {0.77, 1.33} <= {each[0].label["value"] for each in of_sigma}
-    assert all(each[0].config.sigma_d == each[1].config.sigma_d == each[0].label["value"] for each in of_sigma)
-    of_k = [each for each in every if each[0].label["parameter"] == "k"]
-    assert all((each[0].config.sigma_d, each[1].config.sigma_d) == (0.77, 1.33) for each in of_k)
+        some = [each for each in every if each[0].label["parameter"] == parameter]
+        default, own = defaults[parameter], used.get(parameter, (defaults[parameter],))
+        assert [first.label["value"] for first, _ in some] == sorted({*values, default, *own})
+        assert [first.label["value"] for first, _ in some if first.label["default"]] == [default]
+        assert [first.label["value"] for first, _ in some if first.label["own"]] == sorted(own)
+        for first, second in some:
+            assert (first.config.k, second.config.k) == (first.label["value"] if parameter == "k" else 17,) * 2
+            swept = (first.label["value"],) * 2 if parameter == "sigma_d" else (0.77, 1.33)
+            assert (first.config.sigma_d, second.config.sigma_d) == swept
 
 
 def test_sweeps_mark_the_default_and_the_run_and_draw_the_result(tmp_path):
