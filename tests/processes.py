@@ -1,8 +1,9 @@
-"""Processes for tests of what happens when several of them write at once, or are killed."""
+"""Processes for tests: programs, and what happens when several processes write at once or are killed."""
 
 import multiprocessing
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,13 @@ from typing import Any
 FORK = multiprocessing.get_context("fork")
 _RENAMES = {"os.rename", "ctypes.dlopen"}
 """Accesses; renames of Linux are seen by the library that they load."""
+
+
+def run(*words: object, code: int = 0, **how: Any) -> str:
+    """What a program prints, errors too if it fails; it must end with the code."""
+    done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False, **how)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout if code == 0 else done.stdout + done.stderr
 
 
 def together(count: int, action: Callable[[int], Any]) -> list[Any]:

@@ -2,7 +2,6 @@
 
 import json
 import re
-import subprocess
 import sys
 import sysconfig
 import tarfile
@@ -14,16 +13,10 @@ import pytest
 import normlift_ns
 from research import licences
 from tests.conftest import project
+from tests.processes import run
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "normlift_ns").rglob("*.py")}
-
-
-def run(*command: object, cwd: Path, **kwargs) -> str:
-    words = [str(word) for word in command]
-    done = subprocess.run(words, check=False, capture_output=True, text=True, cwd=cwd, **kwargs)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from normlift_ns import open_scene
 from normlift_ns.data.splat import SplatParameters
 from tests.cli.conftest import SMALL
 from tests.data.scene_files import ply_columns, write_ply
+from tests.processes import run
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -27,33 +27,28 @@ def test_the_short_list_is_that_of_the_page_and_of_the_project():
         assert re.split(r"[<>=!~; ]", line)[0] not in ("nerfstudio", "viser")
 
 
-def typed(folder: Path, *words: object) -> str:
-    done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False, cwd=folder)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 @pytest.mark.extra
-def test_a_short_list_of_packages_suffices_without_nerfstudio(trained, tmp_path):
+def test_a_short_list_of_packages_suffices_without_nerfstudio(trained, tmp_path, monkeypatch):
     """In an environment of its own that holds the list and nothing else, a splat of a PLY file is lifted and asked."""
-    run = (sys.executable, "-m", "uv", "pip", "install", "--quiet", "--python", tmp_path / "v" / "bin" / "python")
+    install = (sys.executable, "-m", "uv", "pip", "install", "--quiet", "--python", tmp_path / "v" / "bin" / "python")
     listed = ROOT / "docs" / "without_nerfstudio.txt"
-    typed(tmp_path, sys.executable, "-m", "venv", "--without-pip", tmp_path / "v")
-    typed(tmp_path, *run, "-r", listed)
-    typed(tmp_path, *run, "--no-deps", ROOT)
+    monkeypatch.chdir(tmp_path)
+    run(sys.executable, "-m", "venv", "--without-pip", tmp_path / "v")
+    run(*install, "-r", listed)
+    run(*install, "--no-deps", ROOT)
     python = tmp_path / "v" / "bin" / "python"
     code = "import importlib.util as u; print([n for n in ('nerfstudio', 'viser') if u.find_spec(n)])"
-    assert typed(tmp_path, python, "-c", code).strip() == "[]"
+    assert run(python, "-c", code).strip() == "[]"
     write_ply(tmp_path / "scene.ply", ply_columns(SplatParameters(**open_scene(trained).parameters)))
     room, world = trained.parents[4] / "room", trained.parent / "dataparser_transforms.json"
     places = ("--load-ply", "scene.ply", "--transforms", room / "transforms.json", "--world-transform", world)
     lift = python.with_name("ns-normlift")
-    last = typed(tmp_path, lift, *places, *SMALL, "--queries", "red", "--quiet").splitlines()[-1]
+    last = run(lift, *places, *SMALL, "--queries", "red", "--quiet").splitlines()[-1]
     ask = shlex.split(last)
     assert ask[0] == "ns-normlift-query"
-    typed(tmp_path, python.with_name(ask[0]), *ask[1:], "--output-json", "answers.json")
+    run(python.with_name(ask[0]), *ask[1:], "--output-json", "answers.json")
     assert json.loads((tmp_path / "answers.json").read_text())
-    typed(tmp_path, python.with_name("ns-normlift-export"), *ask[1:3], "--output-dir", "exported")
+    run(python.with_name("ns-normlift-export"), *ask[1:3], "--output-dir", "exported")
 
 
 @pytest.mark.slow

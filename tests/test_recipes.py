@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 
 from normlift_ns import open_run
 from tests.encoders.test_plugins import install
+from tests.processes import run
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text("utf8")
@@ -29,19 +29,14 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     install(copy, "normlift_table", re.sub('"(.*?)"', r"\1", f"[{entry_points}"), code)
     for name in ("A rule", "A scene source", "A reliability", "A rasterizer"):
         (recipe,) = re.findall("```diff\n(.*?)```", PARTS[name], re.DOTALL)
-        words = ["git", "apply", "--verbose", "-"]
         outside = os.environ | {"GIT_CEILING_DIRECTORIES": str(copy.parent)}
-        done = subprocess.run(words, input=recipe, cwd=copy, env=outside, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, f"{name}: {done.stderr}"
+        run("git", "apply", "--verbose", "-", input=recipe, cwd=copy, env=outside)
     return copy
 
 
 def python(extended: Path, *words: object, code: int = 0) -> str:
     paths = os.environ | {"PYTHONPATH": str(extended), "CUDA_VISIBLE_DEVICES": ""}
-    command = [sys.executable, *map(str, words)]
-    done = subprocess.run(command, cwd=extended, env=paths, capture_output=True, text=True, check=False)
-    assert done.returncode == code, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    return run(sys.executable, *words, code=code, cwd=extended, env=paths)
 
 
 RULE = """

@@ -12,7 +12,6 @@ import json
 import os
 import platform
 import re
-import subprocess
 import sys
 from hashlib import blake2b
 from pathlib import Path
@@ -24,6 +23,7 @@ from plyfile import PlyData
 from safetensors.numpy import load_file
 
 from normlift_ns.encoders.color import _names, embed_colors
+from tests.processes import run
 
 TEXTS = {"demo": ("red", "yellow", "sky blue"), "fox": ("orange", "crimson"), "tabletop": ("dusty red", "black")}
 """Queries of each scene, stored in its run."""
@@ -80,9 +80,7 @@ def single_colors(path: Path) -> Path:
 def _command(name: str, *flags: object) -> None:
     threads = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2", "CUDA_VISIBLE_DEVICES": ""}
     start = [sys.executable, "-c", _LIFT] if name == "ns-normlift" else [str(Path(sys.executable).with_name(name))]
-    words = [*start, *map(str, flags)]
-    done = subprocess.run(words, env=os.environ | threads, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    run(*start, *flags, env=os.environ | threads)
 
 
 def summarize(folder: Path) -> dict[str, Any]:

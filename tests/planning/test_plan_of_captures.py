@@ -3,13 +3,13 @@ changes those little. One thread, because threads that wait for each other count
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from tests.captures import SHARED, needs_shared
+from tests.processes import run
 
 PROGRAM = """
 import json, sys, time
@@ -19,8 +19,7 @@ import torch
 from normlift_ns import LiftOptions, SourceOptions, open_scene
 from normlift_ns.encoders.build import make_source
 from normlift_ns.pipeline import lift_scene
-from normlift_ns.planning import measure_capture, time_kernel_loading
-from normlift_ns.planning import make_plan
+from normlift_ns.planning import make_plan, measure_capture, time_kernel_loading
 torch.set_num_threads(1)
 scene, cache = open_scene(sys.argv[1]), Path(sys.argv[2])
 source, options = make_source(SourceOptions(encoder="color")), LiftOptions(max_views=5)
@@ -42,10 +41,8 @@ print(json.dumps(found))
 def test_the_seconds_are_within_a_factor_of_two(tmp_path: Path) -> None:
     config = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
     threads = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    words = [sys.executable, "-W", "ignore", "-c", PROGRAM, str(config), str(tmp_path)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env=os.environ | threads)
-    assert done.returncode == 0, done.stderr
-    first, again = json.loads(done.stdout)
+    told = run(sys.executable, "-W", "ignore", "-c", PROGRAM, config, tmp_path, env=os.environ | threads)
+    first, again = json.loads(told)
     for state in (first, again):
         assert 0.5 < state["told"]["total_s"] / state["taken"] < 2, state
     assert first["told"]["features_kept"] == first["told"]["evidence_kept"] == 0
