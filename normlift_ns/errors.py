@@ -170,7 +170,7 @@ def _log_folders() -> list[Path]:
 
 
 def user_state_folder() -> Path | None:
-    """Return the user's folder for program state, which may not exist yet; None if it is unknown."""
+    """Return this program's folder for user state, which may not exist yet; None if it is unknown."""
     state = Path(os.environ.get("XDG_STATE_HOME", ""))
     with suppress(RuntimeError):
         return (state if state.is_absolute() else Path.home() / ".local" / "state") / "normlift_ns"

@@ -561,7 +561,7 @@ class SourceOptions:
     def looking_for(self, queries: Sequence[str]) -> SourceOptions:
         """Return the options with `queries` as SAM 3 prompts if the regions are sam3 and no prompts are set."""
         missing = self.regions == "sam3" and len(self.sam3_prompts) == 0
-        return replace(self, region_texts=tuple(queries)) if missing else self
+        return replace(self, sam3_prompts=tuple(queries)) if missing else self
 
 
 @renamed(holdout="eval_images")
@@ -646,7 +646,7 @@ class RefineConfig(CheckedOptions):
     parameter that is None takes the default of the kind of vote. A lift may instead measure tau and gamma.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A value has the wrong type or is out of range.
 
     >>> from normlift_ns import RefineConfig
     >>> RefineConfig(vote="paper", k=12).numbers.sigma_d, RefineConfig(vote="posterior").numbers.sigma_d
@@ -777,7 +777,7 @@ class AskOptions:
     """Options of queries: the comparison of prompts with the scene, and the selection of Gaussians.
 
     Raises:
-        ValueError: A value has the wrong type or is out of range, or a prompt is empty.
+        ValueError: A value has the wrong type or is out of range, or a negative prompt is empty or repeated.
     """
 
     negatives: tuple[str, ...] | None = None
@@ -786,8 +786,9 @@ class AskOptions:
     relevancy: RelevancyRule | Literal["auto"] = "auto"
     """Relevancy formula. contrast: the softmax against unrelated words at every Gaussian. cosine: the cosine itself.
     lerf: the smallest softmax against any negative. margin: the cosine minus the largest cosine of a negative. auto:
-    lerf if --negatives has prompts. Otherwise, contrast if the lift compared the scene with unrelated words, else lerf
-    if the text encoder has default negatives, else cosine. Encoders of plugins may have another default."""
+    lerf if --negatives has prompts, and cosine if it is empty. Without --negatives, contrast if the lift compared the
+    scene with unrelated words, else lerf if the text encoder has default negatives, else cosine. Encoders of plugins
+    may have another default."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected. Larger values select fewer Gaussians. auto: a threshold from the
     histogram of relevancies. None: 0.5 for contrast and lerf, 0.02 for margin, and auto for cosine. The encoder color

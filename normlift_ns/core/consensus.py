@@ -216,7 +216,8 @@ def sample_gaussians(
     number is below its share. Sums over the sample are unbiased if every term is divided by its sampling probability.
 
     Args:
-        portion: Part of the Gaussians that `rows` covers (default: all). Counts include all processes.
+        portion: Partition of the Gaussians, if several processes lift the scene. `rows` then covers the Gaussians of
+            this process, and counts include all processes.
     Returns:
         Indices of the sampled rows, and the sampling probability of each.
     """

@@ -123,8 +123,8 @@ class Evidence(TensorRecord):
         """Build evidence from the entries of all views, in the given order.
 
         Raises:
-            ValueError: If `num_gaussians` is not in 0..2**31 - 1, or entries are not sorted, have invalid indices, or
-                have negative or non-finite weights.
+            ValueError: If a number is out of range, such as a `num_gaussians` that is not in 0..2**31 - 1. Also if
+                entries are not distinct and sorted, or have invalid indices, or negative or non-finite weights.
         """
         if not 0 <= num_gaussians < 2**31:
             raise InputError(f"num_gaussians must be in 0..2147483647, got {num_gaussians}")
@@ -219,7 +219,8 @@ class Evidence(TensorRecord):
             columns: New column of every old column, or -1 for none, with one row per level.
             region_view: Index of the view of every new column, in non-decreasing order.
         Raises:
-            ValueError: If a new column does not exist, or belongs to a different view than its old columns.
+            ValueError: If `columns` has the wrong shape, or a new column does not exist or belongs to a different view
+                than its old columns.
         """
         if columns.shape[1] != self.num_regions:
             raise InputError(f"columns must have shape [levels, {self.num_regions}], got {tuple(columns.shape)}")

@@ -67,8 +67,8 @@ class SemanticField(TensorRecord):
     direction."""
     store: StoredEvidence | StoredDirections
     manifest: Mapping[str, Any] = field(default_factory=dict)
-    """JSON-ready metadata: storage (key `form`), sizes and bounds of all storage forms (key `forms`), fingerprint of
-    the means, and provenance."""
+    """JSON-ready metadata: storage (key `form`), sizes and bounds of the compared storage forms (key `forms`),
+    fingerprint of the means, and provenance."""
     means: Float[Tensor, "n 3"] | None = None
     """Centers of the Gaussians at the time of the lift, float32; None in fields of version 0.1."""
     null_level: Float[Tensor, " n"] | None = None
@@ -94,7 +94,9 @@ class SemanticField(TensorRecord):
         storage: Storage | Literal["auto"] = "auto",
         provenance: Mapping[str, Any] | None = None,
     ) -> SemanticField:
-        """Build a field, and record the size and error bound of all three storage forms in its manifest.
+        """Build a field, and record the sizes and error bounds of the compared storage forms in its manifest.
+
+        These are "evidence", "float16" and, if `storage` allows it and a basis meets the tolerance, "low_rank".
 
         Args:
             source: Result of `refine` (default: no refinement).
@@ -216,7 +218,11 @@ class SemanticField(TensorRecord):
 
     @check_arguments
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
-        """Return the unit directions of all or some Gaussians, or 0 for those without a direction."""
+        """Return the unit directions of all or some Gaussians, or 0 for those without a direction.
+
+        Raises:
+            ValueError: If a Gaussian does not exist.
+        """
         rows = torch.arange(len(self), device=self.source.device) if gaussians is None else gaussians
         check_rows("gaussians", rows, len(self))
         rows = self.source.long()[rows] if refined else rows
@@ -239,7 +245,8 @@ class SemanticField(TensorRecord):
             beside: Digests of other files that belong to the field, by their paths relative to the folder.
             own: Skip the checks of `io.guard`, for folders in a run of this package.
         Raises:
-            ValueError: If this would replace an input, a file of a run or data set, or a file of a different type.
+            ValueError: If this would replace an input, a file of a run or data set, or a file of a different type. Also
+                if the manifest cannot be encoded as JSON, or the folder is a file.
             FileExistsError: If the folder contains a field and `overwrite` is False.
             OSError: If a file cannot be written, for instance because the disk is full.
         """
@@ -307,10 +314,11 @@ def choose_form(
     """Choose the storage form. "auto" selects the smallest form whose bound is within the tolerance.
 
     Args:
-        portion: Part of the Gaussians that the lift covers (default: all).
+        portion: Partition of the Gaussians, if several processes lift the scene. The lift then covers the Gaussians of
+            this process.
     Returns:
         Metadata for the manifest about the chosen form and all compared forms, and the basis if the form is "low_rank".
-        "low_rank" is compared only if `storage` allows it and a basis meets the tolerance.
+        "low_rank" is compared only if `storage` is "auto" or "low_rank" and a basis meets the tolerance.
     Raises:
         ValueError: If the storage is unknown, the tolerance is not positive, or no rank meets it for "low_rank".
     """

@@ -45,12 +45,14 @@ def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
     """
     prompts = tuple(dict.fromkeys(prompt for text in texts for prompt in split_prompts(text)))
     if len(texts) > 0 and len(prompts) == 0:
-        raise InputError(f"{name} has only separators, got {', '.join(map(repr, texts))}; give at least one prompt")
+        raise InputError(
+            f"{name} has only blanks and separators, got {', '.join(map(repr, texts))}; give at least one prompt"
+        )
     return prompts
 
 
 def join_prompts(texts: Sequence[str]) -> str:
-    """Join texts into a line that `split_prompts` splits into the same texts.
+    """Join texts into a line that `split_prompts` splits into the same texts, apart from quotes and repeated blanks.
 
     >>> join_prompts(["red mug", "salt, pepper"])
     'red mug, "salt, pepper"'
@@ -196,7 +198,7 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
 QUERIES_FILE = "queries.safetensors"
 """Name of the file of a stored query in the folder of the field. Embeddings are tensors; the rest is metadata."""
 _METADATA_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
-_REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save-query True"
+_REMEDY = "Delete it, or store the query again with: ns-normlift-query --load-config ... --text ... --save-query True"
 
 NonBlankText = Annotated[str, msgspec.Meta(pattern=r"\S")]
 

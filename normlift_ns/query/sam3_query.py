@@ -128,7 +128,7 @@ def mask_evidence(
         valid_pixels: Mask of the pixels to use in each view; None for all pixels.
         options: `rasterize_mode` and `settings` of `rasterize_evidence`.
     Raises:
-        ValueError: The scene has no views, or the masks do not match the number or size of the cameras.
+        ValueError: There are no cameras, or the masks do not match the number or size of the cameras.
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(

@@ -129,7 +129,9 @@ def _with_tiles(job: RasterJob, camera: Camera) -> tuple[projection.AnyProjected
 
 
 def choose_backend(name: str, job: RasterJob) -> tuple[str, Backend]:
-    """Return a backend and its name. "auto" selects the fastest backend that supports the job.
+    """Return the name of a backend and the backend.
+
+    "auto" selects the fastest backend for the device, the precision, the kind of Gaussians and the weight power.
 
     Args:
         name: Name of the backend, or "auto".
@@ -157,7 +159,9 @@ def _fastest(job: RasterJob) -> str:
         return "numba"
     if not means.is_cuda or job.dtype != torch.float32 or means.dtype != torch.float32:
         return "torch"
-    return "triton" if has_triton() else "gsplat"
+    if has_triton():
+        return "triton"
+    return "torch" if job.is_2d or job.weight_power != 1 else "gsplat"
 
 
 # Rasterization of evidence (`rasterize_evidence`) and of values (`render`).
@@ -290,7 +294,7 @@ def render(
     settings: RasterSettings | None = None,
     dtype: torch.dtype | None = None,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """Composite values of Gaussians to sum_j A_ij values_j and sum_j A_ij of every pixel (eq. 2 of the paper).
+    """Composite values of Gaussians; return sum_j A_ij values_j and sum_j A_ij of every pixel i (eq. 2 of the paper).
 
     Args:
         scene: N Gaussians.

@@ -360,7 +360,7 @@ def _panel_width(panels: int) -> int:
 
 
 def _outlined(overlay: Tensor, selected: Tensor, width: int) -> Image.Image:
-    """Scale the overlay to at most `width` pixels, and outline the selection with a white line on a black line."""
+    """Scale the overlay to a width of at most `width` pixels, and outline the selection in white with a black edge."""
     scale = min(width / overlay.shape[1], _MAX_ASPECT * width / overlay.shape[0])
     size = (max(1, round(scale * overlay.shape[1])), max(1, round(scale * overlay.shape[0])))
     image = Image.fromarray(overlay.cpu().numpy()).resize(size, Image.Resampling.BICUBIC)
@@ -543,7 +543,7 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
     """Return training cameras by unique file name.
 
     Args:
-        names: Names from `unique_file_names`, or image paths with or without suffix (default: three views).
+        names: Names from `unique_file_names`, or image paths with or without folder and suffix (default: three views).
     Raises:
         ValueError: A name matches no training image, or several.
     """

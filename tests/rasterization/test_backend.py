@@ -16,6 +16,8 @@ from normlift_ns.rasterization.rasterize import _fastest, choose_backend
 ON_GPU: Any = SimpleNamespace(
     scene=SimpleNamespace(means=SimpleNamespace(device=torch.device("cuda"), is_cuda=True, dtype=torch.float32)),
     dtype=torch.float32,
+    is_2d=False,
+    weight_power=1,
 )
 
 
@@ -49,6 +51,12 @@ def test_before_triton_3_a_gpu_rasterizes_with_stock_gsplat(monkeypatch):
         if not taken:
             with pytest.raises(InputError, match=r"Triton 3, .*PyTorch 2\.4"):
                 choose_backend("triton", ON_GPU)
+
+
+def test_jobs_that_gsplat_cannot_compute_use_torch_without_triton(monkeypatch):
+    install(monkeypatch, None)
+    for change in ({"is_2d": True}, {"weight_power": 2}):
+        assert _fastest(SimpleNamespace(**{**vars(ON_GPU), **change})) == "torch", change
 
 
 def test_a_gpu_that_cannot_start_is_told_of_where_it_is_wanted(monkeypatch):
