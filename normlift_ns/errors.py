@@ -19,7 +19,7 @@ class InputError(ValueError):
 
     The message names the file or argument, what was found, what was expected and what to do. Missing files raise
     `FileNotFoundError` instead, files that cannot be written raise `OSError`, and full memory raises `MemoryError`.
-    `describe_error` lists all exceptions that are not internal errors.
+    The docstring of `describe_error` lists all exceptions that are not internal errors.
 
     >>> from normlift_ns import InputError, LiftOptions
     >>> try:

@@ -299,7 +299,8 @@ class LiftedRun:
     ) -> list[Path]:
         """Write a PNG mask for each training image, with the size of the image, and return the paths.
 
-        A pixel is 255 if the selection makes up more than half of it, else 0. Gaussians in front occlude the selection.
+        A pixel is 255 if the selection contributes more than half of its opacity, else 0. Gaussians in front occlude
+        the selection. Pixels with an opacity of at most 0.05 count as empty.
         The masks fit the undistorted images that the scene was trained with.
 
         Args:

@@ -357,7 +357,7 @@ def diagnose_views(scene: Scene) -> Diagnostic:
     share = float(visible.float().mean())
     message = f"{share:.1%} of the Gaussians are in at least one training view (number of views: {len(scene.train)})"
     if share < _NONE_IN_VIEW:
-        return Diagnostic("in view", "error", message, "give the cameras of this splat, or add --world-transform")
+        return Diagnostic("in view", "error", message, "give the cameras of this splat, or add --world-transform FILE")
     if share < _FEW_IN_VIEW:
         advice = "check that these are the cameras of the splat; the other Gaussians get no semantics"
         return Diagnostic("in view", "warning", message, advice)

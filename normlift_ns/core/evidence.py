@@ -303,7 +303,7 @@ class Evidence(TensorRecord):
             key: The key passed to `save`. With a key, files of version 0.1 are rejected, because they have no digest.
         Raises:
             FileNotFoundError: If the file does not exist.
-            ValueError: If the file is damaged or is not an evidence file.
+            ValueError: If the file is damaged, is not an evidence file, or was saved with another key.
         """
         remedy = "rasterize again"
         arrays = read_evidence(Path(path), key=key, remedy=remedy)

@@ -109,11 +109,9 @@ class SemanticField(TensorRecord):
                 invalid, or no rank meets the tolerance for storage "low_rank".
         """
         n = len(lifted.scalars.norm)
-        if len(means) != n or (source is not None and len(source) != n):
-            raise InputError(
-                f"means and source must have one row per lifted Gaussian ({n}), got {len(means)} and "
-                f"{None if source is None else len(source)}"
-            )
+        for name, rows in (("means", means), ("source", source)):
+            if rows is not None and len(rows) != n:
+                raise InputError(f"{name} must have one row per lifted Gaussian ({n:,}), got {len(rows):,}")
         facts, basis = choose_form(lifted, storage, tolerance)
         if facts["form"] == "evidence":
             store = StoredEvidence(lifted.evidence, lifted.features.float())
@@ -175,8 +173,12 @@ class SemanticField(TensorRecord):
             )
         vectors = torch.as_tensor(text_vectors).to(self.scalars.norm.device, torch.float64)
         length = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
-        if not bool((length.isfinite() & (length > 0)).all()):
-            raise InputError(f"text vectors must be finite and not zero, got lengths {length.flatten().tolist()}")
+        bad = (~(length.isfinite() & (length > 0))).nonzero()
+        if len(bad) > 0:
+            first = int(bad[0, 0])
+            raise InputError(
+                f"text vectors must be finite and not zero, but vector {first} has length {float(length[first]):g}"
+            )
         source = self.source.long() if refined else slice(None)
         cosine = self.scalars.norm.new_empty(len(vectors), len(self), dtype=torch.float32)  # prompts first, in blocks
         for block, rows in zip(cosine.split(PROMPT_BLOCK), (vectors / length).split(PROMPT_BLOCK)):

@@ -126,7 +126,7 @@ def check(job: RasterJob) -> None:
     check_gpu("gsplat", job)
     if job.weight_power != 1:
         raise InputError(
-            f'backend "gsplat" needs weight_power 1, got {job.weight_power}; use backend="triton" for other powers'
+            f'backend "gsplat" needs weight_power 1, got {job.weight_power}; use backend="auto" for other powers'
         )
     if job.is_2d:
         raise InputError('backend "gsplat" draws 3D Gaussians only; use backend="auto" for 2D Gaussians')

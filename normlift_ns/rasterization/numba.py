@@ -32,7 +32,9 @@ def check(job: RasterJob) -> None:
     """Raise ValueError if the scene is not on the CPU."""
     device = job.scene.means.device
     if device.type != "cpu":
-        raise InputError(f'backend "numba" needs a scene on the CPU, got {device}; move it, or use backend="torch"')
+        raise InputError(
+            f'backend "numba" needs a scene on the CPU, got {device}; move the scene, or use backend="auto"'
+        )
 
 
 def in_flight(job: RasterJob, camera: Camera) -> int:

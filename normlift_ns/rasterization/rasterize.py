@@ -146,7 +146,7 @@ def choose_backend(name: str, job: RasterJob) -> tuple[str, Backend]:
         raise InputError(f"backend {name!r} is unknown; choose one of {', '.join(get_args(BackendName))}")
     if name == "triton" and not has_triton():
         raise InputError(
-            'backend "triton" needs Triton 3, which PyTorch 2.4 and later on Linux include; use another backend'
+            'backend "triton" needs Triton 3, which PyTorch 2.4 and later on Linux include; use backend="auto"'
         )
     backend: Any = TileBackend() if name == "torch" else import_module(f"normlift_ns.rasterization.{name}")
     backend.check(job)
@@ -413,9 +413,12 @@ def _job(
             f"dtype must be torch.float32 or torch.float64, got {dtype}; for a {dtype} scene, pass dtype=torch.float32"
         )
     job = RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
-    if job.is_2d and (job.antialiased or job.settings.per_axis):
-        needed = 'rasterize_mode "classic"' if job.antialiased else "the rules of gsplat 1.4 (option gsplat_version)"
-        raise InputError(f"2D Gaussians can be drawn only with {needed}")
+    if job.is_2d and job.antialiased:
+        raise InputError('2D Gaussians need rasterize_mode "classic", got "antialiased"')
+    if job.is_2d and job.settings.per_axis:
+        raise InputError(
+            "2D Gaussians need the rules of gsplat 1.4, got those of a later version; give gsplat_version 1.4"
+        )
     return job
 
 

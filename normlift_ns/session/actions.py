@@ -89,7 +89,7 @@ def threshold_suggestion(state: State) -> float | None:
 def carry_threshold(state: State, question: Query) -> Query:
     """Return `question` with the threshold of the previous query, if both use the same rule.
 
-    A query of clicks alone does not pass its threshold to a query with texts, nor the reverse.
+    A query of clicks alone does not pass its threshold to a query with texts, or vice versa.
 
     If `question` uses the suggested threshold, it gets the previous threshold only if the user chose that threshold.
     """

@@ -41,7 +41,7 @@ def test_gpu_backends_refuse_other_scenes(backend, monkeypatch):
             render(scene, cameras[0], torch.ones(5, 1), backend=backend, dtype=dtype)
     if backend == "gsplat":
         monkeypatch.setattr(gsplat, "check_gpu", lambda *_: None)
-        with pytest.raises(ValueError, match=r'weight_power.* 2;.*backend="triton"'):
+        with pytest.raises(ValueError, match=r'weight_power.* 2;.*backend="auto"'):
             gsplat.check(replace(job(scene), weight_power=2))
 
 
