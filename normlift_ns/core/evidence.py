@@ -196,12 +196,14 @@ class Evidence(TensorRecord):
     def select_gaussians(self, gaussians: Int[Tensor, " m"]) -> Evidence:
         """Return the evidence of some Gaussians, in the given order.
 
+        `num_excluded` is kept, but limited to the number of these Gaussians.
+
         Raises:
             ValueError: If a Gaussian does not exist.
         """
         check_rows("gaussians", gaussians, self.num_gaussians)
         rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
-        return replace(self, rows=rows, unlabeled=unlabeled)
+        return replace(self, rows=rows, unlabeled=unlabeled, num_excluded=min(self.num_excluded, len(rows)))
 
     @check_arguments
     def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
