@@ -318,7 +318,7 @@ def check_prompt_list(name: str, texts: Sequence[str]) -> None:
 
 
 def short_repr(value: object) -> str:
-    """Return the repr of a value for a message, cut to 60 characters, or the type if the repr fails.
+    """Return the repr of a value for a message, cut after 60 characters, or the type if the repr fails.
 
     >>> short_repr("x" * 100)[-5:], short_repr(10**5000)
     ('xxx …', 'a number of type int')
@@ -654,9 +654,9 @@ class RefineConfig(CheckedOptions):
     """
 
     vote: VoteKind = "posterior"
-    """Weight of a Gaussian's own evidence in the vote. posterior: its effective number of views; all neighbors
-    together weigh as much as --vote-prior views. paper: one vote, as for each neighbor (equations 9 and 10 of the
-    paper)."""
+    """Weight of a Gaussian's own evidence in the vote. posterior: the effective number of views that agree on its
+    direction; all neighbors together weigh as much as --vote-prior views. paper: one vote, as for each neighbor
+    (equations 9 and 10 of the paper)."""
     k: int = 36
     """Number of neighbors K in the vote, at least 1. Larger values use a wider neighborhood and take longer. Values
     above 256 count as 256."""

@@ -36,7 +36,7 @@ class GaussianScene(TensorRecord):
 
     Parameters may be NaN, infinite or too large, because training can produce such values. These Gaussians keep their
     rows but are never drawn (see `drawable`), and `Evidence.num_excluded` counts them. They have no evidence, no
-    direction of their own and a reliability of 0, and exports omit them.
+    direction of their own and a reliability of 0. Exports omit those with parameters that are not finite.
 
     Raises:
         ValueError: If a shape, type or device is wrong, a scale is negative, or an opacity is outside 0..1.

@@ -108,7 +108,7 @@ class Lifted:
         The row of a Gaussian does not depend on which others are requested.
 
         Args:
-            dtype: Type of the result (default: that of the features). Half precision also halves the peak memory.
+            dtype: Type of the result (default: that of the features). Half precision halves the memory of the result.
         Raises:
             ValueError: If a Gaussian does not exist, or `dtype` is not a floating-point type.
         """

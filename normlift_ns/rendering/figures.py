@@ -543,7 +543,8 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
     """Return training cameras by unique file name.
 
     Args:
-        names: Names from `unique_file_names`, or image paths with or without folder and suffix (default: three views).
+        names: Names from `unique_file_names`, image paths with or without suffix, or their stems (default: names of
+            three views).
     Raises:
         ValueError: A name matches no training image, or several.
     """
