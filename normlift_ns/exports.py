@@ -178,7 +178,7 @@ def write_splat(
         overwrite: Replace existing files.
     Raises:
         FileExistsError: A file exists, and `overwrite` is False.
-        ValueError: No Gaussian is left to write, the file name has the ending of an unsupported format,
+        ValueError: No Gaussian is left to write, or the file name has the ending of an unsupported format. Also if
             `labels.objects` cannot be encoded as JSON, or a Gaussian is too far from the origin for SPZ.
         OSError: A file cannot be written, for instance because the disk is full.
     """

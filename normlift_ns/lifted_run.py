@@ -163,8 +163,8 @@ class LiftedRun:
                 `negatives` has prompts, and cosine if `negatives` is empty. If `negatives` is None, "auto" is contrast
                 if the lift compared the scene with unrelated words, else the default rule of the encoder.
             threshold: Relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
-                relevancies. None means 0.5 for contrast and lerf, 0.02 for margin, and "auto" for cosine, unless the
-                encoder sets a threshold for its default rule, such as 0.7 for "color".
+                relevancies. None means 0.5 for contrast and lerf, 0.02 for margin, and "auto" for cosine. An
+                encoder may set another threshold for its default rule, such as 0.7 for "color".
             min_reliability: Minimum reliability R of selected Gaussians, in 0..1.
             refined: Use the directions after the vote.
         Raises:
@@ -446,7 +446,7 @@ class LiftedRun:
         """List at most 20 objects of the scene without prompts; see `analysis.inventory`.
 
         An object is named after the best word of the vocabulary. The word must have the verdict "found" and select more
-        than half of the object. It must also match better than chance, which is estimated from the 200 unrelated words
+        than half of the object. It must also match better than chance. Chance is estimated from the 200 unrelated words
         of the encoder, or from a vocabulary of at least 100 words. Without either, and for the color encoder, this test
         is skipped. Other objects are called "object 1", "object 2" and so on.
 

@@ -254,8 +254,8 @@ def measure_core(
 ) -> tuple[dict[str, Rate], Rate]:
     """Measure the cost of each core stage of a lift in seconds, and of the storage in bytes.
 
-    The function repeats the evidence of a few views until it has about as many views as the lift, or about 64 if the
-    lift has more. The cost of further views is extrapolated. `Rate` explains the parts of a cost.
+    The function repeats the evidence of a few views up to about the number of views of the lift, but at most about 64.
+    The cost of further views is extrapolated. `Rate` explains the parts of a cost.
 
     Args:
         evidence: Evidence of a few views.

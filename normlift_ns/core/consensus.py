@@ -320,7 +320,7 @@ def _shares(
     estimate the sums over all Gaussians.
 
     Returns:
-        The shares p_js of visible Gaussians [M, S], a matrix with 1 for every view that shows a Gaussian [M, views],
+        The shares p_js of visible Gaussians [M, S]; a matrix with 1 for every view that shows a Gaussian [M, views];
         and the sum of the shares in every view [M, views].
     """
     group_of_entry, group_row, group_view, weight = _group_by_view(rows, view, views)

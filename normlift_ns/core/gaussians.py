@@ -118,8 +118,8 @@ class Camera:
     """A pinhole camera in the OpenCV convention: x right, y down, z forward, pixel centers at half integers.
 
     Raises:
-        ValueError: If a shape is wrong, a value is not finite, `K` does not have the form below with fx, fy > 0, the
-            pose is not rigid, or the width or height is not in 1..2**20.
+        ValueError: If a shape is wrong, a value is not finite, or the pose is not rigid. Also if `K` does not have the
+            form below with fx, fy > 0, or the width or height is not in 1..2**20.
 
     >>> import torch
     >>> from normlift_ns import Camera

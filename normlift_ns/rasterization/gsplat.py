@@ -120,8 +120,8 @@ def _project_enormous(
 def check(job: RasterJob) -> None:
     """Raise ValueError if gsplat cannot compute a job.
 
-    It needs a scene of 3D Gaussians in float32 on a GPU, weight_power 1, because sums of other powers are not
-    gradients, and an installed version with the constants of the scene.
+    It needs 3D Gaussians in float32 on a GPU, and an installed version with the constants of the scene. It also needs
+    weight_power 1, because sums of other powers are not gradients.
     """
     check_gpu("gsplat", job)
     if job.weight_power != 1:

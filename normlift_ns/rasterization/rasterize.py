@@ -222,8 +222,9 @@ def rasterize_evidence(
         options: Keyword arguments of `RasterOptions`.
 
     Raises:
-        ValueError: If an option is invalid, the backend does not support the scene, labels have a wrong type or size,
-            an id is out of range, or the iterables have different lengths. Messages about labels name the view.
+        ValueError: If an option is invalid, or the backend does not support the scene. Also if labels have a wrong type
+            or size, an id is out of range, or the iterables have different lengths. Messages about labels name the
+            view.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, rasterize_evidence
