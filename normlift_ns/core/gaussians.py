@@ -16,7 +16,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import Primitive
 
 MIN_OPACITY = 1 / 255
-"""Opacity below which Gaussians are never drawn."""
+"""Opacity below which Gaussians are not drawn with the default `RasterSettings.min_alpha`."""
 SH_C0 = 0.28209479177387814
 """sqrt(1 / (4 pi)), the spherical harmonic of degree 0."""
 MAX_SCALE = 4.8517e8

@@ -68,7 +68,7 @@ def nearest_neighbors(
     is not a neighbor of others.
 
     Args:
-        of: Gaussians to find neighbors for, one per row of the result (default: all n).
+        of: Distinct indices of Gaussians to find neighbors for, one per row of the result (default: all n).
         progress: Callback after every block of Gaussians, with the number that are done and their total.
         team: Processes that call this function together, each for a part of the same Gaussians (default: only this
             process).

@@ -442,8 +442,8 @@ def _zip_views(
         for name, item in zip(("cameras", "labels", "num_regions"), items):
             if item is end:
                 raise InputError(
-                    f"{name} has only {index} entries, which is fewer than the views; give one camera and one label "
-                    "map per view, and either one number of regions per view or no num_regions"
+                    f"{name} ends after {index} view{'s' * (index != 1)}, before the other arguments; give one camera "
+                    "and one label map per view, and one number of regions per view or no num_regions"
                 )
         yield items[0], items[1], items[2] if num_regions is not None else None
 

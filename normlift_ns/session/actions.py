@@ -177,7 +177,7 @@ def use_suggested_threshold(state: State) -> State:
     """
     value = threshold_suggestion(state)
     if value is None:
-        raise InputError("This session has no query to suggest a threshold for. Type a prompt and press Ask.")
+        raise InputError("There are no relevancies to suggest a threshold from. Type a prompt and press Ask.")
     return set_threshold(state, value)
 
 
