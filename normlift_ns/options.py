@@ -56,7 +56,6 @@ def _at_least(low: int, high: int = _MAX_INT) -> OptionRange:
 
 
 _POSITIVE = OptionRange(_MIN_DIVISOR, _MAX_FLOAT, f"positive, at least {_MIN_DIVISOR:g}")
-_NOT_NEGATIVE = OptionRange(0.0, _MAX_FLOAT, "not negative")
 _OPTIONS_BY_RANGE = {
     _at_least(0): ("load_step",),
     _at_least(1): ("k", "max_views", "lift_downscale", "consensus_sample", "segment_views", "object_min_gaussians"),
@@ -74,7 +73,7 @@ _OPTIONS_BY_RANGE = {
         "purity",
     ),
     OptionRange(-1.0, 1.0, "in -1..1"): ("tau",),
-    OptionRange(0.0, _MAX_FLOAT, "not negative"): (
+    OptionRange(0.0, _MAX_FLOAT, "at least 0"): (
         "delta",
         "prior",
         "reliability_beta",
@@ -263,9 +262,12 @@ def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -
         raise _error(name, f"a {'whole ' if integer else ''}number", value)
     bounds, number = OPTION_RANGES[name], cast(Any, value)
     if not bounds.low <= number <= bounds.high:  # also true for nan
-        too_large = number > bounds.high and not bounds.description.startswith("in ")
-        limit = "finite" if number == math.inf else f"at most {bounds.high:{',' if integer else 'g'}}"
-        raise _error(name, limit if too_large else bounds.description, value)
+        expected = bounds.description
+        if expected == "finite" and -math.inf < number < math.inf:
+            expected = f"in {bounds.low:g}..{bounds.high:g}"
+        elif number > bounds.high and not expected.startswith("in "):
+            expected = "finite" if number == math.inf else f"at most {bounds.high:{',' if integer else 'g'}}"
+        raise _error(name, expected, value)
     return kind(number)
 
 

@@ -217,7 +217,7 @@ def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
 
 
 def _share_of(views: int, share: float) -> int:
-    """Round a share of the views to a number, which is 0 only for share 0 and `views` only for share 1.
+    """Round a share of two or more views to a number, which is 0 only for share 0 and `views` only for share 1.
 
     >>> _share_of(45, 0.999), _share_of(45, 1.0), _share_of(45, 0.0)
     (44, 45, 0)
