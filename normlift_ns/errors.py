@@ -19,7 +19,7 @@ class InputError(ValueError):
 
     The message names the file or argument, what was found, what was expected and what to do. Missing files raise
     `FileNotFoundError` instead, files that cannot be written raise `OSError`, and full memory raises `MemoryError`.
-    `describe_error` lists all exceptions that are not internal errors.
+    The docstring of `describe_error` lists all exceptions that are not internal errors.
 
     >>> from normlift_ns import InputError, LiftOptions
     >>> try:
@@ -170,7 +170,7 @@ def _log_folders() -> list[Path]:
 
 
 def user_state_folder() -> Path | None:
-    """Return the user's folder for program state, which may not exist yet; None if it is unknown."""
+    """Return this program's folder for user state, which may not exist yet; None if it is unknown."""
     state = Path(os.environ.get("XDG_STATE_HOME", ""))
     with suppress(RuntimeError):
         return (state if state.is_absolute() else Path.home() / ".local" / "state") / "normlift_ns"

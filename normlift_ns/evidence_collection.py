@@ -387,7 +387,7 @@ def _downscaled(view: View, divisor: int) -> View:
     if min(height, width) < _MIN_SIDE:
         raise InputError(
             f"lift_downscale {divisor:,} reduces {view.name} from {camera.width} x {camera.height} to {width} x "
-            f"{height} pixels; give a factor that leaves at least {_MIN_SIDE} pixels on each side"
+            f"{height} pixels; give a smaller number that leaves at least {_MIN_SIDE} pixels on each side"
         )
     return view.downscaled(height, width)
 
@@ -410,10 +410,10 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
         return
     file, width, height = maps.size(name)
     sizes = [(view.camera.width, view.camera.height) for view in views]
-    reason = "training undistorted the image"
     if (width, height) not in sizes:
         kind = "the size of the original image" if (width, height) == original_size else "a different size"
-        mismatch = f"is {width}x{height} (width x height), {kind}; {reason} to {sizes[0][0]}x{sizes[0][1]}"
+        to_size = f"training undistorted the image to {sizes[0][0]}x{sizes[0][1]}"
+        mismatch = f"is {width}x{height} (width x height), {kind}; {to_size}"
         if not maps.resample:
             raise InputError(
                 f"label map {file} of {name} {mismatch}. Make the label maps from the undistorted images, or give "
@@ -422,8 +422,8 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
         warnings.warn(f"label map {file} {mismatch}. The map is resized, and may be off by a few pixels", stacklevel=2)
     elif (width, height) == original_size:
         warnings.warn(
-            f"{reason} without changing its size. Make sure that the label maps in {file.parent} were made from the "
-            "undistorted images",
+            f"training undistorted images without changing their size. Make sure that the label maps in {file.parent} "
+            "were made from the undistorted images",
             stacklevel=2,
         )
 

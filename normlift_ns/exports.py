@@ -52,7 +52,11 @@ _MAX_COMMENT_LENGTH = 60
 def semantic_columns(field: SemanticField, answer: Answer | None, instances: Instances | None) -> dict[str, np.ndarray]:
     """Return columns by name: reliability, n_eff, relevancy_0, … in float32, and class_id and instance_id in uint32.
 
-    Ids are unsigned, with 0 for none, because splat converters turn -1 into 4294967295.
+    Relevancies need an answer, and ids need instances. Ids are unsigned, with 0 for none, because splat converters
+    turn -1 into 4294967295.
+
+    Raises:
+        ValueError: The answer and the field have different numbers of Gaussians.
     """
     if answer is not None and len(answer.relevancy) != len(field):
         raise InputError(
@@ -174,7 +178,7 @@ def write_splat(
         overwrite: Replace existing files.
     Raises:
         FileExistsError: A file exists, and `overwrite` is False.
-        ValueError: No Gaussian is left to write, the file name has the ending of an unsupported format,
+        ValueError: No Gaussian is left to write, or the file name has the ending of an unsupported format. Also if
             `labels.objects` cannot be encoded as JSON, or a Gaussian is too far from the origin for SPZ.
         OSError: A file cannot be written, for instance because the disk is full.
     """
@@ -280,7 +284,7 @@ def export_paths(path: Path) -> tuple[Path, Path, Path, Path]:
 
 
 def _comment(text: str) -> str:
-    """Return the text as a single line of ASCII, as the header of a PLY file requires."""
+    """Return the text as one line of at most 60 ASCII characters; a line of a PLY header must be ASCII."""
     return " ".join(text.encode("ascii", "replace").decode().split())[:_MAX_COMMENT_LENGTH]
 
 
@@ -373,7 +377,9 @@ def read_cloud(path: Path) -> PlyData:
     names = {} if vertex is None else {item.name: item for item in vertex.properties}
     if vertex is None or not set("xyz") <= set(names) or vertex.count == 0:
         count = 0 if vertex is None else vertex.count
-        raise InputError(f"{path} has {', '.join(names) or 'no properties'} of {count:,} vertices. {expected}")
+        properties = f"the properties {', '.join(names)}" if len(names) > 0 else "no properties"
+        vertices = "vertex" if count == 1 else "vertices"
+        raise InputError(f"{path} has {count:,} {vertices} with {properties}. {expected}")
     lists = [name for name, item in names.items() if hasattr(item, "len_dtype")]
     if len(lists) > 0:
         raise InputError(f"{path} has vertices with list properties ({', '.join(lists)}); remove these. {expected}")

@@ -103,7 +103,7 @@ class LiftedRun:
     scene: Scene
     field: SemanticField
     device: str = "cpu"
-    """Device of the text encoder."""
+    """Device of the text encoder, and of the rendering for catalogs and inventories."""
     seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Duration of each stage of the lift, in seconds; empty for a run that was opened from disk."""
 
@@ -160,16 +160,16 @@ class LiftedRun:
             negatives: Negative prompts for the rules lerf and margin. If None, use those of the encoder, or else
                 `CANONICAL_NEGATIVES`.
             relevancy: Formula that computes relevancy from cosines; see `normlift_ns.relevancy`. "auto" is lerf if
-                `negatives` has prompts. Otherwise, it is contrast if the lift compared the scene with unrelated words,
-                else the default rule of the encoder.
+                `negatives` has prompts, and cosine if `negatives` is empty. If `negatives` is None, "auto" is contrast
+                if the lift compared the scene with unrelated words, else the default rule of the encoder.
             threshold: Relevancy above which a Gaussian is selected. "auto" derives it from the histogram of
-                relevancies. None means 0.5 for contrast and lerf, 0.02 for margin, and "auto" for cosine, unless the
-                encoder sets a threshold for its default rule, such as 0.7 for "color".
+                relevancies. None means 0.5 for contrast and lerf, 0.02 for margin, and "auto" for cosine. An
+                encoder may set another threshold for its default rule, such as 0.7 for "color".
             min_reliability: Minimum reliability R of selected Gaussians, in 0..1.
             refined: Use the directions after the vote.
         Raises:
-            ValueError: No prompt is given, a prompt is empty, the encoder cannot encode a prompt, or a vector has
-                another number of values than the features.
+            ValueError: No prompt is given, a prompt is empty, the encoder cannot encode a prompt, or an option is
+                invalid. Also if a vector has another number of values than the features, is zero or is not finite.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -219,7 +219,8 @@ class LiftedRun:
         ns-render and ns-viewer then show the relevancy of its prompts.
 
         Raises:
-            ValueError: The vectors of the query and the directions of the field have different dimensions.
+            ValueError: The query is not valid, or its vectors have another number of values than the features.
+            FileNotFoundError: The run was moved or deleted.
         """
         question = question.question if isinstance(question, Answer) else question
         if question.embeddings.shape[1] != self.field.dimension:
@@ -245,7 +246,7 @@ class LiftedRun:
         """Write Gaussians to a file, and their row indices in the scene to <stem>_rows.npy next to it.
 
         With an answer, the names of its classes and objects are written to <stem>_names.json. PLY and GLB files also
-        contain reliabilities, relevancies and labels.
+        contain reliabilities, and with an answer relevancies and labels.
 
         Args:
             path: File to write. Names that end with .glb, .spz or .compressed.ply select these formats, and all other
@@ -298,7 +299,8 @@ class LiftedRun:
     ) -> list[Path]:
         """Write a PNG mask for each training image, with the size of the image, and return the paths.
 
-        A pixel is 255 if the selection makes up more than half of it, else 0. Gaussians in front occlude the selection.
+        A pixel is 255 if the selection contributes more than half of its opacity, else 0. Gaussians in front occlude
+        the selection. Pixels with an opacity of at most 0.05 count as empty.
         The masks fit the undistorted images that the scene was trained with.
 
         Args:
@@ -444,7 +446,7 @@ class LiftedRun:
         """List at most 20 objects of the scene without prompts; see `analysis.inventory`.
 
         An object is named after the best word of the vocabulary. The word must have the verdict "found" and select more
-        than half of the object. It must also match better than chance, which is estimated from the 200 unrelated words
+        than half of the object. It must also match better than chance. Chance is estimated from the 200 unrelated words
         of the encoder, or from a vocabulary of at least 100 words. Without either, and for the color encoder, this test
         is skipped. Other objects are called "object 1", "object 2" and so on.
 
@@ -726,8 +728,8 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> config_classes.Tra
 def splat_config(scene: SplatScene, run_dir: Path) -> config_classes.TrainerConfig:
     """Return a nerfstudio config for a run lifted from a PLY file or gsplat checkpoint, which has no config of its own.
 
-    With this config, nerfstudio loads the cameras in the run directory without transforming them. All paths except that
-    of the field are absolute, because the run has no training directory as a base for relative paths.
+    With this config, nerfstudio loads the cameras in the run directory without transforming them. All paths
+    outside the run directory are absolute, because the run has no training directory as a base for relative paths.
     """
     cameras = run_dir / TRANSFORMS_FILE
     dataparser = config_classes.NerfstudioDataParserConfig(

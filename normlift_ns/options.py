@@ -56,7 +56,6 @@ def _at_least(low: int, high: int = _MAX_INT) -> OptionRange:
 
 
 _POSITIVE = OptionRange(_MIN_DIVISOR, _MAX_FLOAT, f"positive, at least {_MIN_DIVISOR:g}")
-_NOT_NEGATIVE = OptionRange(0.0, _MAX_FLOAT, "not negative")
 _OPTIONS_BY_RANGE = {
     _at_least(0): ("load_step",),
     _at_least(1): ("k", "max_views", "lift_downscale", "consensus_sample", "segment_views", "object_min_gaussians"),
@@ -74,7 +73,7 @@ _OPTIONS_BY_RANGE = {
         "purity",
     ),
     OptionRange(-1.0, 1.0, "in -1..1"): ("tau",),
-    OptionRange(0.0, _MAX_FLOAT, "not negative"): (
+    OptionRange(0.0, _MAX_FLOAT, "at least 0"): (
         "delta",
         "prior",
         "reliability_beta",
@@ -263,9 +262,12 @@ def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -
         raise _error(name, f"a {'whole ' if integer else ''}number", value)
     bounds, number = OPTION_RANGES[name], cast(Any, value)
     if not bounds.low <= number <= bounds.high:  # also true for nan
-        too_large = number > bounds.high and not bounds.description.startswith("in ")
-        limit = "finite" if number == math.inf else f"at most {bounds.high:{',' if integer else 'g'}}"
-        raise _error(name, limit if too_large else bounds.description, value)
+        expected = bounds.description
+        if expected == "finite" and -math.inf < number < math.inf:
+            expected = f"in {bounds.low:g}..{bounds.high:g}"
+        elif number > bounds.high and not expected.startswith("in "):
+            expected = "finite" if number == math.inf else f"at most {bounds.high:{',' if integer else 'g'}}"
+        raise _error(name, expected, value)
     return kind(number)
 
 
@@ -318,7 +320,7 @@ def check_prompt_list(name: str, texts: Sequence[str]) -> None:
 
 
 def short_repr(value: object) -> str:
-    """Return the repr of a value for a message, cut to 60 characters, or the type if the repr fails.
+    """Return the repr of a value for a message, cut after 60 characters, or the type if the repr fails.
 
     >>> short_repr("x" * 100)[-5:], short_repr(10**5000)
     ('xxx …', 'a number of type int')
@@ -561,7 +563,7 @@ class SourceOptions:
     def looking_for(self, queries: Sequence[str]) -> SourceOptions:
         """Return the options with `queries` as SAM 3 prompts if the regions are sam3 and no prompts are set."""
         missing = self.regions == "sam3" and len(self.sam3_prompts) == 0
-        return replace(self, region_texts=tuple(queries)) if missing else self
+        return replace(self, sam3_prompts=tuple(queries)) if missing else self
 
 
 @renamed(holdout="eval_images")
@@ -646,7 +648,7 @@ class RefineConfig(CheckedOptions):
     parameter that is None takes the default of the kind of vote. A lift may instead measure tau and gamma.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A value has the wrong type or is out of range.
 
     >>> from normlift_ns import RefineConfig
     >>> RefineConfig(vote="paper", k=12).numbers.sigma_d, RefineConfig(vote="posterior").numbers.sigma_d
@@ -654,9 +656,9 @@ class RefineConfig(CheckedOptions):
     """
 
     vote: VoteKind = "posterior"
-    """Weight of a Gaussian's own evidence in the vote. posterior: its effective number of views; all neighbors
-    together weigh as much as --vote-prior views. paper: one vote, as for each neighbor (equations 9 and 10 of the
-    paper)."""
+    """Weight of a Gaussian's own evidence in the vote. posterior: the effective number of views that agree on its
+    direction; all neighbors together weigh as much as --vote-prior views. paper: one vote, as for each neighbor
+    (equations 9 and 10 of the paper)."""
     k: int = 36
     """Number of neighbors K in the vote, at least 1. Larger values use a wider neighborhood and take longer. Values
     above 256 count as 256."""
@@ -777,7 +779,7 @@ class AskOptions:
     """Options of queries: the comparison of prompts with the scene, and the selection of Gaussians.
 
     Raises:
-        ValueError: A value has the wrong type or is out of range, or a prompt is empty.
+        ValueError: A value has the wrong type or is out of range, or a negative prompt is empty or repeated.
     """
 
     negatives: tuple[str, ...] | None = None
@@ -786,8 +788,9 @@ class AskOptions:
     relevancy: RelevancyRule | Literal["auto"] = "auto"
     """Relevancy formula. contrast: the softmax against unrelated words at every Gaussian. cosine: the cosine itself.
     lerf: the smallest softmax against any negative. margin: the cosine minus the largest cosine of a negative. auto:
-    lerf if --negatives has prompts. Otherwise, contrast if the lift compared the scene with unrelated words, else lerf
-    if the text encoder has default negatives, else cosine. Encoders of plugins may have another default."""
+    lerf if --negatives has prompts, and cosine if it is empty. Without --negatives, contrast if the lift compared the
+    scene with unrelated words, else lerf if the text encoder has default negatives, else cosine. Encoders of plugins
+    may have another default."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected. Larger values select fewer Gaussians. auto: a threshold from the
     histogram of relevancies. None: 0.5 for contrast and lerf, 0.02 for margin, and auto for cosine. The encoder color

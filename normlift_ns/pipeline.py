@@ -141,9 +141,9 @@ def lift_run(
         report: Progress callback, called with (stage, steps done, total steps).
         say: Callback for status lines and warnings, such as `print`.
     Raises:
-        FileExistsError: The run directory exists and `overwrite` is False.
+        FileExistsError: The run directory of this `timestamp` exists, and `overwrite` is False.
         FileNotFoundError, ValueError: As in `open_scene`; also if an image, a label map or an option is not valid.
-        MemoryError: The lift does not fit into GPU memory.
+        MemoryError: The lift does not fit into memory or into GPU memory.
         TypeError: `config_or_scene` is neither a config nor a scene from `open_scene` or `open_splat`.
 
     >>> scene = open_scene(config)

@@ -217,7 +217,7 @@ def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
 
 
 def _share_of(views: int, share: float) -> int:
-    """Round a share of the views to a number, which is 0 only for share 0 and `views` only for share 1.
+    """Round a share of two or more views to a number, which is 0 only for share 0 and `views` only for share 1.
 
     >>> _share_of(45, 0.999), _share_of(45, 1.0), _share_of(45, 0.0)
     (44, 45, 0)
@@ -254,8 +254,8 @@ def measure_core(
 ) -> tuple[dict[str, Rate], Rate]:
     """Measure the cost of each core stage of a lift in seconds, and of the storage in bytes.
 
-    The function repeats the evidence of a few views until it has about as many views as the lift, but at most 64. The
-    cost of further views is extrapolated. `Rate` explains the parts of a cost.
+    The function repeats the evidence of a few views up to about the number of views of the lift, but at most about 64.
+    The cost of further views is extrapolated. `Rate` explains the parts of a cost.
 
     Args:
         evidence: Evidence of a few views.
@@ -357,7 +357,7 @@ def diagnose_views(scene: Scene) -> Diagnostic:
     share = float(visible.float().mean())
     message = f"{share:.1%} of the Gaussians are in at least one training view (number of views: {len(scene.train)})"
     if share < _NONE_IN_VIEW:
-        return Diagnostic("in view", "error", message, "give the cameras of this splat, or add --world-transform")
+        return Diagnostic("in view", "error", message, "give the cameras of this splat, or add --world-transform FILE")
     if share < _FEW_IN_VIEW:
         advice = "check that these are the cameras of the splat; the other Gaussians get no semantics"
         return Diagnostic("in view", "warning", message, advice)
@@ -385,7 +385,9 @@ def describe_recognition(facts: Mapping[str, Any]) -> str:
 
 
 def diagnose_recognition(run_dirs: Iterable[Path]) -> list[Diagnostic]:
-    """Report how well the first lifted run in the given folders recognizes left-out views, according to its manifest.
+    """Report how well the first lifted run in the given folders recognizes regions of left-out views.
+
+    The numbers are those of its manifest. If no folder contains a lifted run, return an empty list.
 
     Args:
         run_dirs: Folders that may contain a lifted run.
@@ -463,7 +465,9 @@ def diagnose_weights(missing: Sequence[str], options: SourceOptions, device: str
         options = resolve_source(options, device)
         used = f" (encoder {options.encoder}, regions {options.regions})" if options.features == "none" else ""
         return Diagnostic("weights", "ok", f"all required weights are on this machine{used}")
-    message = f"not on this machine: {'; '.join(missing)}. A lift downloads only those from the Hugging Face hub"
+    message = (
+        f"not on this machine: {'; '.join(missing)}. A lift downloads missing weights only from the Hugging Face hub"
+    )
     return Diagnostic(
         "weights",
         "warning",

@@ -146,6 +146,8 @@ def is_kind(kind: str, value: Any) -> bool:
         return is_array({"float": "f", "whole": "iu", "bool": "b", "uint8": "u"}[word], axes, value)
     if word in ("texts", "Cameras"):
         return isinstance(value, list | tuple) and all(isinstance(item, str) and word == "texts" for item in value)
+    if word == "pair":
+        return isinstance(value, list | tuple) and len(value) == 2 and all(type(item) is int for item in value)
     if word == "option":
         return not isinstance(value, Nothing) and not callable(value)
     kinds = {"bool": bool, "text": str, "path": str | Path, "dictionary": Mapping, "maps": list | tuple,

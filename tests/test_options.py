@@ -182,3 +182,12 @@ def test_options_within_options_of_a_command_are_a_message(monkeypatch, capsys):
     shown = " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert stop.value.code != 0
     assert re.search("sigma_d must be .* 1e-06, got nan", shown) and "Traceback" not in shown
+
+
+def test_sam3_without_prompts_looks_for_the_queries():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = SourceOptions(regions="sam3").looking_for(["mug", "bowl"])
+    assert found.sam3_prompts == ("mug", "bowl")
+    own = SourceOptions(regions="sam3", sam3_prompts=("fox",))
+    assert own.looking_for(["mug"]) == own

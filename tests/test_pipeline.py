@@ -145,7 +145,7 @@ def test_maps_of_undistorted_images_are_taken(tmp_path: Path) -> None:
         lifted(langsplat(tmp_path / "l", HEIGHT, WIDTH), cache, undistorted, lift_downscale=2)
         lifted(langsplat(tmp_path / "l", HEIGHT // 2, WIDTH // 2), cache, scene())
     for source in (langsplat(tmp_path / "l", HEIGHT, WIDTH), files(tmp_path / "maps", FULL)):
-        with pytest.warns(UserWarning, match="without changing its size"):
+        with pytest.warns(UserWarning, match="without changing their size"):
             lifted(source, cache, scene(original=(WIDTH, HEIGHT)))
     mask = torch.ones(HEIGHT, WIDTH + 1, dtype=torch.bool)
     with pytest.raises(nl.InputError, match=r"the mask of images/a\.png is \(18, 25\), but its camera is \(18, 24\)"):

@@ -65,7 +65,7 @@ def check_arguments(target: _T) -> _T:
 
 
 def _checks_of(owner: Any, function: Any) -> tuple[Callable[[], Iterable[tuple[str, _Check]]], dict[str, _Check]]:
-    """Return a function that lists (name, check) pairs of positional arguments, and the checks of keywords."""
+    """Return a function that lists (name, check) pairs of positional arguments, and the checks of arguments by name."""
     hints = get_type_hints(owner, localns=cast(Any, _Names(sys.modules[owner.__module__].__dict__)))
     named, ordered, more = dict[str, _Check](), list[tuple[str, _Check]](), ("", _anything)
     for p in inspect.signature(function).parameters.values():
@@ -191,7 +191,11 @@ def _check_any(checks: Sequence[_Check], optional: bool, name: str, value: Any, 
 
 
 def _list_check(origin: type, hint: Any) -> _Check:
-    """Return the check for a sequence or an iterable. Items of an iterable are checked and converted lazily."""
+    """Return the check for a sequence or an iterable.
+
+    Items of lists, tuples and ranges are checked immediately. Items of other sequences are not checked, and those of
+    other iterables are checked lazily.
+    """
     item = _check_of(hint)
 
     def check(name: str, value: Any, _: _Sizes) -> Any:

@@ -216,7 +216,8 @@ def sample_gaussians(
     number is below its share. Sums over the sample are unbiased if every term is divided by its sampling probability.
 
     Args:
-        portion: Part of the Gaussians that `rows` covers (default: all). Counts include all processes.
+        portion: Partition of the Gaussians, if several processes lift the scene. `rows` then covers the Gaussians of
+            this process, and counts include all processes.
     Returns:
         Indices of the sampled rows, and the sampling probability of each.
     """
@@ -319,7 +320,7 @@ def _shares(
     estimate the sums over all Gaussians.
 
     Returns:
-        The shares p_js of visible Gaussians [M, S], a matrix with 1 for every view that shows a Gaussian [M, views],
+        The shares p_js of visible Gaussians [M, S]; a matrix with 1 for every view that shows a Gaussian [M, views];
         and the sum of the shares in every view [M, views].
     """
     group_of_entry, group_row, group_view, weight = _group_by_view(rows, view, views)

@@ -53,7 +53,7 @@ def has_triton() -> bool:
 
 
 def can_use_triton(tensor: Tensor) -> bool:
-    """Return True if the tensor is on a GPU and Triton is installed."""
+    """Return True if the tensor is on a GPU and `has_triton` is True."""
     return tensor.is_cuda and has_triton()
 
 
@@ -97,7 +97,7 @@ _triton_lock = Lock()
 
 
 def load_triton() -> None:
-    """Load the hash of Triton's files and the driver, which all kernels of Triton need, once in this process.
+    """Compute the hash of Triton's files and load its driver, once in this process. All Triton kernels need both.
 
     Without the lock, every thread that compiles a kernel would compute the hash and compile the driver. Errors are
     ignored here. They occur again in the first kernel.
@@ -198,7 +198,8 @@ class AdaptiveBatches:
         The last batch is padded with copies of its last item. All batches therefore have the same shape, unless the
         batch size is reduced, and the other items of a batch change a row only by rounding.
 
-        The next part is requested when a batch has room for more items. Rows are yielded as soon as they are computed.
+        The next part is requested when a batch has room for more items. The rows of a part are yielded together, after
+        all of them are computed.
 
         Raises:
             MemoryError: If a single item does not fit into GPU memory.

@@ -123,8 +123,8 @@ class Evidence(TensorRecord):
         """Build evidence from the entries of all views, in the given order.
 
         Raises:
-            ValueError: If `num_gaussians` is not in 0..2**31 - 1, or entries are not sorted, have invalid indices, or
-                have negative or non-finite weights.
+            ValueError: If a number is out of range, such as a `num_gaussians` that is not in 0..2**31 - 1. Also if
+                entries are not distinct and sorted, or have invalid indices, or negative or non-finite weights.
         """
         if not 0 <= num_gaussians < 2**31:
             raise InputError(f"num_gaussians must be in 0..2147483647, got {num_gaussians}")
@@ -196,12 +196,14 @@ class Evidence(TensorRecord):
     def select_gaussians(self, gaussians: Int[Tensor, " m"]) -> Evidence:
         """Return the evidence of some Gaussians, in the given order.
 
+        `num_excluded` is kept, but limited to the number of these Gaussians.
+
         Raises:
             ValueError: If a Gaussian does not exist.
         """
         check_rows("gaussians", gaussians, self.num_gaussians)
         rows, unlabeled = self.rows.select_rows(gaussians), self.unlabeled.select_rows(gaussians)
-        return replace(self, rows=rows, unlabeled=unlabeled)
+        return replace(self, rows=rows, unlabeled=unlabeled, num_excluded=min(self.num_excluded, len(rows)))
 
     @check_arguments
     def regroup(self, columns: Int[Tensor, "levels s"], region_view: Int32[Tensor, " m"]) -> Evidence:
@@ -219,7 +221,8 @@ class Evidence(TensorRecord):
             columns: New column of every old column, or -1 for none, with one row per level.
             region_view: Index of the view of every new column, in non-decreasing order.
         Raises:
-            ValueError: If a new column does not exist, or belongs to a different view than its old columns.
+            ValueError: If `columns` has the wrong shape, or a new column does not exist or belongs to a different view
+                than its old columns.
         """
         if columns.shape[1] != self.num_regions:
             raise InputError(f"columns must have shape [levels, {self.num_regions}], got {tuple(columns.shape)}")
@@ -302,7 +305,7 @@ class Evidence(TensorRecord):
             key: The key passed to `save`. With a key, files of version 0.1 are rejected, because they have no digest.
         Raises:
             FileNotFoundError: If the file does not exist.
-            ValueError: If the file is damaged or is not an evidence file.
+            ValueError: If the file is damaged, is not an evidence file, or was saved with another key.
         """
         remedy = "rasterize again"
         arrays = read_evidence(Path(path), key=key, remedy=remedy)

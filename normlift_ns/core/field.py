@@ -67,8 +67,8 @@ class SemanticField(TensorRecord):
     direction."""
     store: StoredEvidence | StoredDirections
     manifest: Mapping[str, Any] = field(default_factory=dict)
-    """JSON-ready metadata: storage (key `form`), sizes and bounds of all storage forms (key `forms`), fingerprint of
-    the means, and provenance."""
+    """JSON-ready metadata: storage (key `form`), sizes and bounds of the compared storage forms (key `forms`),
+    fingerprint of the means, and provenance."""
     means: Float[Tensor, "n 3"] | None = None
     """Centers of the Gaussians at the time of the lift, float32; None in fields of version 0.1."""
     null_level: Float[Tensor, " n"] | None = None
@@ -94,7 +94,9 @@ class SemanticField(TensorRecord):
         storage: Storage | Literal["auto"] = "auto",
         provenance: Mapping[str, Any] | None = None,
     ) -> SemanticField:
-        """Build a field, and record the size and error bound of all three storage forms in its manifest.
+        """Build a field, and record the sizes and error bounds of the compared storage forms in its manifest.
+
+        These are "evidence", "float16" and, if `storage` allows it and a basis meets the tolerance, "low_rank".
 
         Args:
             source: Result of `refine` (default: no refinement).
@@ -107,11 +109,9 @@ class SemanticField(TensorRecord):
                 invalid, or no rank meets the tolerance for storage "low_rank".
         """
         n = len(lifted.scalars.norm)
-        if len(means) != n or (source is not None and len(source) != n):
-            raise InputError(
-                f"means and source must have one row per lifted Gaussian ({n}), got {len(means)} and "
-                f"{None if source is None else len(source)}"
-            )
+        for name, rows in (("means", means), ("source", source)):
+            if rows is not None and len(rows) != n:
+                raise InputError(f"{name} must have one row per lifted Gaussian ({n:,}), got {len(rows):,}")
         facts, basis = choose_form(lifted, storage, tolerance)
         if facts["form"] == "evidence":
             store = StoredEvidence(lifted.evidence, lifted.features.float())
@@ -173,8 +173,12 @@ class SemanticField(TensorRecord):
             )
         vectors = torch.as_tensor(text_vectors).to(self.scalars.norm.device, torch.float64)
         length = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
-        if not bool((length.isfinite() & (length > 0)).all()):
-            raise InputError(f"text vectors must be finite and not zero, got lengths {length.flatten().tolist()}")
+        bad = (~(length.isfinite() & (length > 0))).nonzero()
+        if len(bad) > 0:
+            first = int(bad[0, 0])
+            raise InputError(
+                f"text vectors must be finite and not zero, but vector {first} has length {float(length[first]):g}"
+            )
         source = self.source.long() if refined else slice(None)
         cosine = self.scalars.norm.new_empty(len(vectors), len(self), dtype=torch.float32)  # prompts first, in blocks
         for block, rows in zip(cosine.split(PROMPT_BLOCK), (vectors / length).split(PROMPT_BLOCK)):
@@ -216,7 +220,11 @@ class SemanticField(TensorRecord):
 
     @check_arguments
     def directions(self, gaussians: Int[Tensor, " m"] | None = None, *, refined: bool = True) -> Float[Tensor, "m d"]:
-        """Return the unit directions of all or some Gaussians, or 0 for those without a direction."""
+        """Return the unit directions of all or some Gaussians, or 0 for those without a direction.
+
+        Raises:
+            ValueError: If a Gaussian does not exist.
+        """
         rows = torch.arange(len(self), device=self.source.device) if gaussians is None else gaussians
         check_rows("gaussians", rows, len(self))
         rows = self.source.long()[rows] if refined else rows
@@ -239,7 +247,8 @@ class SemanticField(TensorRecord):
             beside: Digests of other files that belong to the field, by their paths relative to the folder.
             own: Skip the checks of `io.guard`, for folders in a run of this package.
         Raises:
-            ValueError: If this would replace an input, a file of a run or data set, or a file of a different type.
+            ValueError: If this would replace an input, a file of a run or data set, or a file of a different type. Also
+                if the manifest cannot be encoded as JSON, or the folder is a file.
             FileExistsError: If the folder contains a field and `overwrite` is False.
             OSError: If a file cannot be written, for instance because the disk is full.
         """
@@ -307,10 +316,11 @@ def choose_form(
     """Choose the storage form. "auto" selects the smallest form whose bound is within the tolerance.
 
     Args:
-        portion: Part of the Gaussians that the lift covers (default: all).
+        portion: Partition of the Gaussians, if several processes lift the scene. The lift then covers the Gaussians of
+            this process.
     Returns:
         Metadata for the manifest about the chosen form and all compared forms, and the basis if the form is "low_rank".
-        "low_rank" is compared only if `storage` allows it and a basis meets the tolerance.
+        "low_rank" is compared only if `storage` is "auto" or "low_rank" and a basis meets the tolerance.
     Raises:
         ValueError: If the storage is unknown, the tolerance is not positive, or no rank meets it for "low_rank".
     """

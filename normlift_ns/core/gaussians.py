@@ -16,7 +16,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import Primitive
 
 MIN_OPACITY = 1 / 255
-"""Opacity below which Gaussians are never drawn."""
+"""Opacity below which Gaussians are not drawn with the default `RasterSettings.min_alpha`."""
 SH_C0 = 0.28209479177387814
 """sqrt(1 / (4 pi)), the spherical harmonic of degree 0."""
 MAX_SCALE = 4.8517e8
@@ -25,8 +25,8 @@ overflow float32."""
 MAX_MEAN = 1e18
 """Largest coordinate of a mean in world units; squared distances must fit into float32."""
 QUATERNION_RANGE = (1e-18, 1e18)
-"""Valid range of a quaternion's largest component. Outside it, the squared length is not a normal float32 number, and
-the rotation becomes NaN or the identity."""
+"""Valid range of the largest absolute component of a quaternion. Outside it, the squared length may not be a normal
+float32 number, and the rotation may become NaN or the identity."""
 
 
 @check_arguments
@@ -36,7 +36,7 @@ class GaussianScene(TensorRecord):
 
     Parameters may be NaN, infinite or too large, because training can produce such values. These Gaussians keep their
     rows but are never drawn (see `drawable`), and `Evidence.num_excluded` counts them. They have no evidence, no
-    direction and a reliability of 0, and exports omit them.
+    direction of their own and a reliability of 0. Exports omit those with parameters that are not finite.
 
     Raises:
         ValueError: If a shape, type or device is wrong, a scale is negative, or an opacity is outside 0..1.
@@ -53,7 +53,7 @@ class GaussianScene(TensorRecord):
     means: Float[Tensor, "n 3"]
     """Centers in world units."""
     quats: Float[Tensor, "n 4"]
-    """Rotations as quaternions (w, x, y, z) of any non-zero length."""
+    """Rotations as quaternions (w, x, y, z), which need not be normalized."""
     scales: Float[Tensor, "n 3"]
     """Standard deviations along the three axes in world units, >= 0; linear, not logarithms."""
     opacities: Float[Tensor, " n"]
@@ -88,7 +88,7 @@ class GaussianScene(TensorRecord):
 
     @cached_property
     def drawable(self) -> Bool[Tensor, " n"]:
-        """Mask of the Gaussians that are drawn.
+        """Mask of the Gaussians that can be drawn.
 
         Their parameters are finite and within limits for float32. The limits are the same for all precisions and
         backends.
@@ -118,8 +118,8 @@ class Camera:
     """A pinhole camera in the OpenCV convention: x right, y down, z forward, pixel centers at half integers.
 
     Raises:
-        ValueError: If a shape is wrong, the intrinsics are not finite or have skew, the pose is not rigid, or the size
-            is out of range.
+        ValueError: If a shape is wrong, a value is not finite, or the pose is not rigid. Also if `K` does not have the
+            form below with fx, fy > 0, or the width or height is not in 1..2**20.
 
     >>> import torch
     >>> from normlift_ns import Camera

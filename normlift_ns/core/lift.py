@@ -62,7 +62,7 @@ class Scalars(TensorRecord):
     c_inter: Float[Tensor, " n"]
     """Agreement between views, in 0..1."""
     n_eff: Float[Tensor, " n"]
-    """Effective number of views, in 1..view_count, or 0 without evidence."""
+    """Effective number of views, in 1..view_count, or 0 without a direction."""
     reliability: Float[Tensor, " n"]
     """Reliability R_j, in 0..1."""
     weight: Float[Tensor, " n"]
@@ -103,12 +103,14 @@ class Lifted:
     def directions(
         self, gaussians: Int[Tensor, " m"] | None = None, *, dtype: torch.dtype | None = None
     ) -> Float[Tensor, "m d"]:
-        """Return u_j of all or some Gaussians as unit rows, or 0 without evidence.
+        """Return u_j of all or some Gaussians as unit rows, or 0 for those without a direction.
 
         The row of a Gaussian does not depend on which others are requested.
 
         Args:
-            dtype: Type of the result (default: that of the features). Half precision also halves the peak memory.
+            dtype: Type of the result (default: that of the features). Half precision halves the memory of the result.
+        Raises:
+            ValueError: If a Gaussian does not exist, or `dtype` is not a floating-point type.
         """
         dtype = dtype or self.features.dtype
         if not dtype.is_floating_point:

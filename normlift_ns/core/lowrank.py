@@ -33,7 +33,7 @@ class Basis(NamedTuple):
 
     rows: Float64[Tensor, "r d"]
     bound: Float64[Tensor, " n"]
-    """Bound on |<u_j, t> - <u'_j, t>| for all unit vectors t, or 0 without evidence. u'_j is the projected and
+    """Bound on |<u_j, t> - <u'_j, t>| for all unit vectors t, or 0 without a direction. u'_j is the projected and
     renormalized direction."""
 
 
@@ -110,7 +110,7 @@ class StoredEvidence(TensorRecord):
     features: Float[Tensor, "s d"]
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
-        """Return cosines to unit vectors t as E (F t) / (W_j ||f_j||), computed in float64, or 0 without evidence."""
+        """Return cosines to unit vectors t as E (F t) / (W_j ||f_j||), computed in float64; 0 without a direction."""
         transposed = vectors.double().T  # block by block, because each block of float64 fits into the CPU cache
         table = torch.cat([block.double() @ transposed for block in self.features.split(_BLOCK_ROWS)])
         length = scalars.weight.double() * scalars.norm.double()
@@ -118,7 +118,7 @@ class StoredEvidence(TensorRecord):
         return torch.where((length > 0)[:, None], sums / length[:, None], 0.0).clamp(-1, 1).float()
 
     def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
-        """Return the unit directions of some Gaussians, or 0 without evidence."""
+        """Return the unit directions of some Gaussians, or 0 for those without a direction."""
         sums = self.evidence.rows.select_rows(gaussians).sums_of_unit_rows(self.features)
         mask = (scalars.norm[gaussians] > 0)[:, None]
         return torch.where(mask, sums / torch.linalg.vector_norm(sums, dim=1, keepdim=True), 0.0).float()
@@ -126,7 +126,7 @@ class StoredEvidence(TensorRecord):
 
 @dataclass(frozen=True)
 class StoredDirections(TensorRecord):
-    """Directions of the M Gaussians with evidence, as float16 vectors or as float16 coordinates in a basis."""
+    """Directions of the M Gaussians that have one, as float16 vectors or as float16 coordinates in a basis."""
 
     coordinates: Float16[Tensor, "m r"]
     basis: Float[Tensor, "r d"] | None
@@ -137,7 +137,7 @@ class StoredDirections(TensorRecord):
         return (self.coordinates if self.basis is None else self.basis).shape[1]
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
-        """Return cosines to unit vectors, or 0 without evidence."""
+        """Return cosines to unit vectors, or 0 for Gaussians without a direction."""
         projected = vectors.float() if self.basis is None else vectors.float() @ self.basis.T
         out = vectors.new_zeros(scalars.norm.numel(), len(vectors), dtype=torch.float32)
         step = max(1, (_GPU_BLOCK if self.coordinates.is_cuda else _CPU_BLOCK) // projected.shape[1])
@@ -145,7 +145,7 @@ class StoredDirections(TensorRecord):
         return out.clamp_(-1, 1)
 
     def directions(self, gaussians: Int[Tensor, " m"], scalars: Scalars) -> Float[Tensor, "m d"]:
-        """Return the unit directions of some Gaussians, or 0 without evidence."""
+        """Return the unit directions of some Gaussians, or 0 for those without a direction."""
         mask = scalars.norm > 0
         row = (mask.cumsum(0) - 1)[gaussians].clamp(min=0)
         rows = self.coordinates[row].float() if self.basis is None else self.coordinates[row].float() @ self.basis
@@ -153,7 +153,7 @@ class StoredDirections(TensorRecord):
 
 
 def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, " n"]) -> StoredDirections:
-    """Return the directions of all Gaussians with evidence.
+    """Return the directions of all Gaussians that have one.
 
     Args:
         basis: Vectors of the basis as rows, to store coordinates in it, or None to store full directions.
@@ -166,7 +166,7 @@ def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, 
 def encode_directions(
     lifted: Lifted, basis: Tensor | None, blocks: Iterable[Int64[Tensor, " _"]]
 ) -> tuple[Float16[Tensor, "m r"], Int64[Tensor, " m"]]:
-    """Return the float16 coordinates of every Gaussian with evidence, and its row in the lift, block by block.
+    """Return the float16 coordinates of every Gaussian with a direction, and its row in the lift, block by block.
 
     Rounding may depend on which rows are multiplied together. The blocks are therefore the same for any number of
     processes.
@@ -205,7 +205,8 @@ def sizes_and_bounds(
     """Return the size in bytes of each storage form, without scalars and source, and its bound on the cosine error.
 
     Args:
-        portion: Part of the Gaussians that the lift covers (default: all).
+        basis: Basis of the form "low_rank", or None to leave this form out.
+        portion: As in `core.field.choose_form`.
     """
     mask, evidence = lifted.scalars.norm > 0, lifted.evidence
     sizes = torch.stack([mask.sum(), mask.new_tensor(evidence.nnz, dtype=torch.int64), evidence.unlabeled.offsets[-1]])

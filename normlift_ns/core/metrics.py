@@ -1,4 +1,4 @@
-"""Metrics of segmentation, localization and ranking, for labels of any dimension."""
+"""Metrics of segmentation, localization and ranking."""
 
 from __future__ import annotations
 
@@ -117,9 +117,9 @@ class Correlation(NamedTuple):
     """Rank correlation of two arrays."""
 
     value: float
-    """Coefficient in -1..1; NaN if one array is constant."""
+    """Coefficient in -1..1; NaN if an array is constant or empty."""
     p: float
-    """Two-sided p-value in 0..1; NaN if one array is constant."""
+    """Two-sided p-value in 0..1; NaN if an array is constant or empty."""
 
 
 def spearman_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
@@ -145,7 +145,9 @@ def lowest_jaccard(a: Float[Tensor, " n"], b: Float[Tensor, " n"], share: float 
 def bin_means(
     key: Float[Tensor, " n"], values: Float[Tensor, " n"], bins: int = 10
 ) -> tuple[Float64[Tensor, " bins"], Float64[Tensor, " bins"]]:
-    """Return the means of keys and values in bins of equal count, by ascending key. Ties are ordered by index.
+    """Return the means of keys and values in bins by ascending key. Ties are ordered by index.
+
+    The numbers of points in two bins differ by at most 1.
 
     Raises:
         ValueError: If there are fewer points than bins.

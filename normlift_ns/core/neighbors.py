@@ -19,10 +19,7 @@ from normlift_ns.options import check_number
 MAX_NEIGHBORS = 1024
 """Largest number K of neighbors. Memory grows with K times the number of Gaussians."""
 _MAX_UNCERTAIN = 1000
-"""Largest number of rows that the GPU repeats with all distances because it could not certify their neighbors.
-
-For more rows, the CPU is faster.
-"""
+"""Largest number of uncertain rows for which the GPU computes all distances. For more rows, the CPU is faster."""
 _BLOCK = 2**14
 """Number of positions per query of the k-d tree."""
 _MAX_RANKED = 2**22
@@ -65,12 +62,13 @@ def nearest_neighbors(
     """Find the exact K nearest neighbors in 3D, N_K(i) of the paper, excluding self.
 
     The CPU uses a k-d tree of the distinct positions, because any number of Gaussians may share a position. The GPU
-    uses `kernels.nearest` for float32 means and K up to 60. This search certifies the rows of its result, except those
-    with more ties than candidates. For these rows, the GPU computes all distances. If there are too many of them, the
-    CPU repeats the search. A Gaussian whose mean is not finite has no neighbors and is not a neighbor of others.
+    uses `kernels.nearest` for float32 means and K up to 60. A row of its result is uncertain if a Gaussian that the
+    search dropped could be as near as the last neighbor. For up to 1,000 uncertain rows, the GPU computes all
+    distances. If there are more, the CPU repeats the search. A Gaussian whose mean is not finite has no neighbors and
+    is not a neighbor of others.
 
     Args:
-        of: Gaussians to find neighbors for, one per row of the result (default: all n).
+        of: Distinct indices of Gaussians to find neighbors for, one per row of the result (default: all n).
         progress: Callback after every block of Gaussians, with the number that are done and their total.
         team: Processes that call this function together, each for a part of the same Gaussians (default: only this
             process).

@@ -14,8 +14,8 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 PARTITION_BLOCK = 2**13
-"""Number of consecutive Gaussians on the Morton curve that form a block. Each process has whole blocks. Matrix products
-then have the same shapes, and therefore the same rounding, for any number of processes."""
+"""Number of consecutive Gaussians on the Morton curve that form a block. Each process has whole blocks, so that matrix
+products have the same shapes, and therefore the same rounding, for any number of processes."""
 
 
 class Communicator(ABC):
@@ -117,8 +117,8 @@ class Partition:
 def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
     """Return the indices of all Gaussians along a Morton curve, which keeps neighbors in space close to each other.
 
-    The curve has 1,024 steps per side, from the 1st to the 99th percentile of the means. With the full range, distant
-    outliers would put all other Gaussians into one cell.
+    The curve has 1,024 steps per axis, from the 1st to the 99th percentile of the means; means outside this range are
+    clamped to it. With the full range, distant outliers would put all other Gaussians into one cell.
 
     >>> spatial_order(torch.tensor([[3.0, 0, 0], [0.0, 0, 0], [2.0, 0, 0]])).tolist()
     [1, 2, 0]

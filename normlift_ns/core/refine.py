@@ -27,7 +27,8 @@ _CHUNK_ELEMENTS = (2**22, 2**24)
 _BLOCK = (2 * PARTITION_BLOCK, 16 * PARTITION_BLOCK)
 """Number of Gaussians per block, on CPU and GPU. Directions of one block and its neighbors are in memory at a time."""
 MAX_VOTERS = 256
-"""Largest K of a vote. Time grows with the square of K, because a vote compares all pairs of neighbors."""
+"""Largest K that `clamp_k` allows. The time of a vote grows with the square of K, because it compares all pairs of
+neighbors."""
 _MAX_KERNEL_NEIGHBORS = 63
 """Largest K that `kernels.vote` supports."""
 
@@ -60,7 +61,7 @@ def refine(
 
     All votes use the unrefined directions. In a tie, the nearer neighbor wins. If no neighbor is reliable, i keeps its
     direction (see `unsupported`). Gaussian i also keeps its direction if less than `min_labeled` of its weight lies in
-    regions. If R_i = 0, S_ii is 0 too, and the best neighbor wins if its support exceeds Delta.
+    regions. If R_i = 0, S_ii is 0 too, and the best neighbor wins if its S_ij exceeds Delta.
 
     Args:
         config: Options of the vote (default: the posterior vote with `own`, else the paper's vote).
@@ -76,7 +77,7 @@ def refine(
         progress: Callback after every block of Gaussians, with the number that are done and their total.
     Raises:
         ValueError: If shapes disagree, a direction is neither a unit vector nor 0, `reliability` or `own` is invalid,
-            or `own` is missing.
+            `neighbors` has an invalid index, or `own` is missing.
 
     >>> import torch
     >>> from normlift_ns import RefineConfig, refine
@@ -118,7 +119,7 @@ def labeled_share(evidence: Evidence) -> Float64[Tensor, " n"]:
 def _check_inputs(
     directions: Tensor | Callable[[Tensor], Tensor], reliability: Tensor, own: Tensor | None, *, posterior: bool
 ) -> None:
-    """Raise ValueError if the inputs of a vote are inconsistent."""
+    """Raise ValueError if an input of a vote is invalid or missing."""
     if posterior and own is None:
         raise InputError("a posterior vote needs own, got None; pass scalars.own_evidence of the lift")
     check_not_negative("reliability", reliability)

@@ -115,8 +115,8 @@ def relevancy(
         negative: Cosine to each negative prompt (rules "lerf" and "margin"), or the null level (rule "contrast").
         rule: "contrast" is "lerf" with a null level [..., 1] as the only negative. "cosine" is the cosine itself, in
             -1..1. "lerf" is the smallest softmax of the prompt against one negative, in 0..1 (LERF, section 3.4). At
-            0.5, prompt and negative are equally similar. "margin" is the cosine minus the largest background cosine,
-            in -2..2.
+            0.5, prompt and negative are equally similar. "margin" is the cosine minus the largest cosine to a
+            negative, in -2..2.
         temperature: Factor of the cosines inside the softmax, > 0.
     Raises:
         ValueError: If a cosine is not in -1..1, `temperature` is out of range, the rule is unknown, or the rule needs
@@ -152,8 +152,8 @@ def _relevancy(positive: Any, negative: Any, rule: RelevancyRule, temperature: f
         negative = cast(Any, convert(negative))
     if rule == "contrast" and (negative is None or negative.shape[-1] == 0):
         raise InputError(
-            'rule "contrast" compares with unrelated words, but this run stores no comparison; lift again, or choose '
-            'rule "cosine"'
+            'rule "contrast" needs the null levels of a lift that compared the scene with unrelated words, got none; '
+            'lift again, or choose rule "cosine"'
         )
     if RELEVANCY_RULES[rule].needs_negatives and (negative is None or negative.shape[-1] == 0):
         raise InputError(
@@ -169,7 +169,7 @@ def gaussian_relevancy(
     """Compute the relevancy of Gaussians. Those without a direction (not `valid`) get `no_direction` of the rule.
 
     Raises:
-        ValueError: If the rule is unknown, or if it needs negatives and none are given.
+        ValueError: If the rule needs negatives or null levels, and none are given.
     """
     values = _relevancy(positive, negative, rule, TEMPERATURE)
     return _namespace(values).where(valid[:, None], values, RELEVANCY_RULES[rule].no_direction)
@@ -195,7 +195,10 @@ def top_values(values: Float[ArrayT, "n q"]) -> list[float]:
 
 
 def _largest(values: Float[np.ndarray, " m"], count: int) -> Float[np.ndarray, " count"]:
-    """Return the largest values in ascending order. A sample bounds them, so that only few values are sorted."""
+    """Return the `count` largest values in ascending order.
+
+    A sample gives a lower bound for them, so that only few values are sorted.
+    """
     sample = np.sort(values[::_SAMPLED])
     bound = sample[-min(len(sample), 2 * count // _SAMPLED + 8)]
     candidates = values[values >= bound]

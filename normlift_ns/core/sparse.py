@@ -74,7 +74,7 @@ class SparseRows(TensorRecord):
         """
         dtype = parts[0][2].dtype if parts else torch.float32
         parts = [part for part in parts if part[0].numel() > 0]
-        if device.type == "cuda" and len(parts) > 1 and sum(len(part[0]) for part in parts) < _MAX_SORTED:
+        if device.type == "cuda" and len(parts) > 1 and sum(len(part[0]) for part in parts) <= _MAX_SORTED:
             row, column, weight = (torch.cat(x) for x in zip(*parts))
             row, order = row.int().sort(stable=True)
             ends = torch.searchsorted(row, torch.arange(num_rows + 1, dtype=torch.int32, device=device))
@@ -185,7 +185,8 @@ class SparseRows(TensorRecord):
     def chunks(self, row_size: int) -> Iterator[tuple[int, SparseRows]]:
         """Yield consecutive blocks of rows as (first row, block).
 
-        A dense array with `row_size` elements for each row of a block has at most about 2**24 elements.
+        A dense array with `row_size` elements for each row of a block has at most 2**24 elements, unless a single row
+        has more.
         """
         step = max(1, CHUNK_ELEMENTS // max(1, row_size))
         for first in range(0, len(self), step):

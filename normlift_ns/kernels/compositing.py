@@ -208,7 +208,8 @@ def build_cell_lists(
 UNROLL = 4
 """Number of splats between two checks whether all pixels of a cell are finished."""
 _MOST_SLOTS = 2**26
-"""Largest number of slots in a chunk. A slot holds one sum and its key, and takes 8 or 12 bytes."""
+"""Largest number of slots in a chunk, apart from those of its first cell. A slot holds one sum and its key, and takes
+8 or 12 bytes."""
 _COPIED = 128
 """Number of sums that a program of `_pack` copies in one step."""
 _PLACES = 512
@@ -455,7 +456,7 @@ def sum_regions(
 def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, int]]:
     """Return ranges (first cell, last cell, first slot, last slot), with exclusive ends.
 
-    A range has at most _MOST_SLOTS slots or is a single cell.
+    The cells of a range after the first one have at most _MOST_SLOTS slots together.
     """
     total = int(slots[-1])
     if total <= _MOST_SLOTS:

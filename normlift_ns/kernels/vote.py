@@ -150,7 +150,7 @@ def _halve(rows, high, low, rough, dimension, BLOCK: tl.constexpr):
 def split_float16(
     rows: Float32[Tensor, "m d"],
 ) -> tuple[Float16[Tensor, "m d"], Float16[Tensor, "m d"], Float32[Tensor, " m"]]:
-    """Return h, 2048 l and |l| of unit rows u = h + l. |l| is inf for rows longer than 1."""
+    """Return h, 2048 l and |l| of unit rows u = h + l. |l| is inf for rows with a squared length of 1.01 or more."""
     high, low = (torch.empty_like(rows, dtype=torch.float16) for _ in range(2))
     rough = torch.empty(len(rows), device=rows.device)
     if len(rows) > 0:

@@ -156,7 +156,7 @@ class Answer:
             return list(pool.map(Finding.to_json, answer))
 
     def _summarize(self) -> list[dict[str, Any]]:
-        """Return the result of `to_json`, computed for all prompts at once."""
+        """Return the result of `to_json`, computed for all prompts together on the GPU."""
         from normlift_ns.query.summaries import summarize  # noqa: PLC0415 (needs torch)
 
         scalars, positions = self.field.scalars, suggested_range(self.field)
@@ -263,7 +263,7 @@ class Finding:
 
     @cached_property
     def verdict(self) -> Verdict | None:
-        """Presence of the prompt in the scene; None if there is nothing to compare its cosines with.
+        """Presence of the prompt in the scene; None as in `query.threshold.judge`, or if no Gaussian has a direction.
 
         For a prompt that selects Gaussians, a weak match replaces "probably not here".
         """
@@ -369,8 +369,8 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
     Args:
         means: Centers of the Gaussians, as a tensor or array like those of the field.
     Raises:
-        ValueError: The embeddings have a different dimension than the field, or the negatives that the rule needs are
-            missing.
+        ValueError: The embeddings have a different dimension than the field, or the negatives or null levels that the
+            rule needs are missing.
     """
     vectors, count = question.embeddings, len(question.embeddings)
     if RELEVANCY_RULES[question.rule].needs_negatives and question.negative_embeddings is not None:

@@ -45,12 +45,14 @@ def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
     """
     prompts = tuple(dict.fromkeys(prompt for text in texts for prompt in split_prompts(text)))
     if len(texts) > 0 and len(prompts) == 0:
-        raise InputError(f"{name} has only separators, got {', '.join(map(repr, texts))}; give at least one prompt")
+        raise InputError(
+            f"{name} has only blanks and separators, got {', '.join(map(repr, texts))}; give at least one prompt"
+        )
     return prompts
 
 
 def join_prompts(texts: Sequence[str]) -> str:
-    """Join texts into a line that `split_prompts` splits into the same texts.
+    """Join texts into a line that `split_prompts` splits into the same texts, apart from quotes and repeated blanks.
 
     >>> join_prompts(["red mug", "salt, pepper"])
     'red mug, "salt, pepper"'
@@ -196,7 +198,7 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
 QUERIES_FILE = "queries.safetensors"
 """Name of the file of a stored query in the folder of the field. Embeddings are tensors; the rest is metadata."""
 _METADATA_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
-_REMEDY = "Delete it, or store the queries again with: ns-normlift-query --load-config ... --text ... --save-query True"
+_REMEDY = "delete it, or store the query again with: ns-normlift-query --load-config ... --text ... --save-query True"
 
 NonBlankText = Annotated[str, msgspec.Meta(pattern=r"\S")]
 
@@ -253,15 +255,15 @@ def load_query(folder: Path) -> Query | None:
     path = folder / QUERIES_FILE
     if not os.path.lexists(path):
         return None
+    if not os.path.isfile(path):
+        raise InputError(f"{path} is not a regular file; {_REMEDY}")
+    arrays, metadata, _ = load_arrays(path, legacy_keys=(_METADATA_KEY,), remedy=_REMEDY)
     try:
-        if not os.path.isfile(path):
-            raise InputError("it is not a regular file")
-        arrays, metadata, _ = load_arrays(path, legacy_keys=(_METADATA_KEY,), remedy=_REMEDY)
         if set(metadata) != {_METADATA_KEY}:
             raise InputError(f"its metadata keys are {sorted(metadata)}, expected {_METADATA_KEY}")
         return _decode(folder, metadata[_METADATA_KEY], arrays)
     except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
-        raise InputError(f"{path} is damaged ({type(error).__name__}: {error}). {_REMEDY}") from error
+        raise InputError(f"{path} is damaged ({error}); {_REMEDY}") from error
 
 
 def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:

@@ -6,8 +6,8 @@ The relevancy of a Gaussian for a prompt is the fraction of its weight inside th
 The mask of a whole view can be wrong, because SAM 3 misses an object or confuses it with another one. Two rounds
 therefore determine the voting views. In the first round, all views in which SAM 3 found the prompt vote. In the second
 round, a view votes if the weighted intersection over union of its mask and the Gaussians selected in the first round
-exceeds one half, or if both are empty. If SAM 3 found the prompt in none of these views, the result is that of the
-first round.
+exceeds one half. It also votes if both are empty. If SAM 3 found the prompt in none of these views, the result is that
+of the first round.
 
 All pixels of a view that does not vote are unlabeled. With `unlabeled="dilute"`, they lower the reliability of the
 Gaussians that they show. Agreement and reliability are those of `core.lift` for two regions per view, inside and
@@ -128,7 +128,7 @@ def mask_evidence(
         valid_pixels: Mask of the pixels to use in each view; None for all pixels.
         options: `rasterize_mode` and `settings` of `rasterize_evidence`.
     Raises:
-        ValueError: The scene has no views, or the masks do not match the number or size of the cameras.
+        ValueError: There are no cameras, or the masks do not match the number or size of the cameras.
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Summaries of many prompts at once, for answers on a GPU. They equal those of `Finding.to_json` up to rounding.
+"""Summaries of many prompts together, for answers on a GPU. They equal those of `Finding.to_json` up to rounding.
 
 The sums, sorts and counts over Gaussians are operations on blocks of prompts. Only a few numbers per prompt leave the
 GPU, from which `query.threshold` computes the rest.
@@ -33,7 +33,7 @@ def summarize(
     threshold: float,
     positions: tuple[float, float],
 ) -> list[dict[str, Any]]:
-    """Return the numbers of `query.engine.Finding.to_json` for each prompt.
+    """Return the entries of `query.engine.Finding.to_json` for each prompt, except text, verdict and read_as.
 
     Args:
         valid: True for Gaussians that have a direction; at least one has.

@@ -227,8 +227,8 @@ def own_words(field: HasManifest) -> tuple[str, ...]:
 def default_rule(field: HasManifest) -> DefaultRule:
     """Return the default rule, negatives and threshold of queries of a field.
 
-    The rule is contrast for a field with a null level. For other fields, it is the rule of the encoder, or cosine if
-    the encoder is unknown or a file of text embeddings does not contain the default negatives of the encoder.
+    The rule is contrast for a field with a null level. For other fields, it is the rule of the encoder. It is
+    cosine if the encoder is unknown, or if a file of text embeddings lacks the default negatives of the encoder.
     """
     if field.manifest.get("null_words") is not None:
         return _CONTRAST

@@ -114,7 +114,7 @@ def _histogram(values: Float64[np.ndarray, " n"], threshold: float, positions: t
 def picked_ranks(count: int) -> list[int]:
     """Return the ranks, in ascending order of relevancy, of the relevancies that `make_histograms` needs.
 
-    They are the smallest and the largest, u (see the module docstring), and those around the median and around the top.
+    They are the smallest and the largest, u (see above), and those around the median and around the top.
     """
     around = [min(int(share * (count - 1)) + i, count - 1) for share in (0.5, TOP_QUANTILE) for i in (0, 1)]
     return [0, count - 1, count - 1 - min(_SMALLEST_OBJECT, count // 1000), *around]
@@ -256,7 +256,7 @@ def null_rank(manifest: Mapping[str, Any], top_cosine: float) -> float | None:
 
 
 def compares_cosines(manifest: Mapping[str, Any], encoder: str | None) -> bool:
-    """Return whether `judge` uses cosines (with limits of the encoder or null words) instead of relevancies."""
+    """Return True if `judge` uses cosines (with limits of the encoder or null words), False if it uses relevancies."""
     kind = find_encoder_kind(encoder)
     return (kind is not None and kind.present_from is not None) or null_rank(manifest, 0.0) is not None
 

@@ -118,8 +118,16 @@ def _project_enormous(
 
 
 def check(job: RasterJob) -> None:
-    """Raise ValueError if a scene is not in float32 on a GPU, has 2D Gaussians, or needs another version of gsplat."""
+    """Raise ValueError if gsplat cannot compute a job.
+
+    It needs 3D Gaussians in float32 on a GPU, and an installed version with the constants of the scene. It also needs
+    weight_power 1, because sums of other powers are not gradients.
+    """
     check_gpu("gsplat", job)
+    if job.weight_power != 1:
+        raise InputError(
+            f'backend "gsplat" needs weight_power 1, got {job.weight_power}; use backend="auto" for other powers'
+        )
     if job.is_2d:
         raise InputError('backend "gsplat" draws 3D Gaussians only; use backend="auto" for 2D Gaussians')
     compiled = installed_settings()
@@ -179,15 +187,7 @@ def in_flight(job: RasterJob, camera: Camera) -> int:
 
 
 def views_evidence(job: RasterJob, batch: RasterBatch) -> Entries:
-    """Return the entries of views, computed with gsplat's forward and backward pass.
-
-    Raises:
-        ValueError: If weight_power is not 1, because sums of other powers are not gradients.
-    """
-    if job.weight_power != 1:
-        raise InputError(
-            f'backend "gsplat" needs weight_power 1, got {job.weight_power}; use backend="triton" for other powers'
-        )
+    """Return the entries of views, computed with gsplat's forward and backward pass."""
     parts, before = [], 0
     for camera, label_map, count in zip(*batch):
         for first, gradient in _gradients(job, camera, label_map, count):

@@ -32,7 +32,9 @@ def check(job: RasterJob) -> None:
     """Raise ValueError if the scene is not on the CPU."""
     device = job.scene.means.device
     if device.type != "cpu":
-        raise InputError(f'backend "numba" needs a scene on the CPU, got {device}; move it, or use backend="torch"')
+        raise InputError(
+            f'backend "numba" needs a scene on the CPU, got {device}; move the scene, or use backend="auto"'
+        )
 
 
 def in_flight(job: RasterJob, camera: Camera) -> int:
@@ -193,7 +195,7 @@ parallel_kernel = cached_njit(parallel=True)
 
 
 def exp(x: float) -> float:
-    """Return e ** x for x <= 0 in the precision of x, with an error below 1e-7 (float32) or 4e-16 (float64).
+    """Return e ** x for x <= 0 in the precision of x. The absolute error is below 1e-7 (float32) or 4e-16 (float64).
 
     Results are clamped from below to e ** -87 (float32) or e ** -700 (float64).
     """
@@ -607,7 +609,7 @@ def sum_tiles(  # pragma: no cover (compiled)
     slots,
     threads,
 ):
-    """Write one slot (Gaussian, label, sum of A_ij ** power) per tile, Gaussian and label with a positive sum.
+    """Write one slot (Gaussian, label, sum of A_ij ** power) per tile, Gaussian and label >= -1 with a positive sum.
 
     The slots of a tile start at first_slot[tile], and their number is written to used[tile].
     """

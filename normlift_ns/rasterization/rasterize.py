@@ -129,7 +129,9 @@ def _with_tiles(job: RasterJob, camera: Camera) -> tuple[projection.AnyProjected
 
 
 def choose_backend(name: str, job: RasterJob) -> tuple[str, Backend]:
-    """Return a backend and its name. "auto" selects the fastest backend that supports the job.
+    """Return the name of a backend and the backend.
+
+    "auto" selects the fastest backend for the device, the precision, the kind of Gaussians and the weight power.
 
     Args:
         name: Name of the backend, or "auto".
@@ -144,7 +146,7 @@ def choose_backend(name: str, job: RasterJob) -> tuple[str, Backend]:
         raise InputError(f"backend {name!r} is unknown; choose one of {', '.join(get_args(BackendName))}")
     if name == "triton" and not has_triton():
         raise InputError(
-            'backend "triton" needs Triton 3, which PyTorch 2.4 and later on Linux include; use another backend'
+            'backend "triton" needs Triton 3, which PyTorch 2.4 and later on Linux include; use backend="auto"'
         )
     backend: Any = TileBackend() if name == "torch" else import_module(f"normlift_ns.rasterization.{name}")
     backend.check(job)
@@ -157,7 +159,9 @@ def _fastest(job: RasterJob) -> str:
         return "numba"
     if not means.is_cuda or job.dtype != torch.float32 or means.dtype != torch.float32:
         return "torch"
-    return "triton" if has_triton() else "gsplat"
+    if has_triton():
+        return "triton"
+    return "torch" if job.is_2d or job.weight_power != 1 else "gsplat"
 
 
 # Rasterization of evidence (`rasterize_evidence`) and of values (`render`).
@@ -218,8 +222,9 @@ def rasterize_evidence(
         options: Keyword arguments of `RasterOptions`.
 
     Raises:
-        ValueError: If an option is invalid, the backend does not support the scene, labels have a wrong type or size,
-            an id is out of range, or the iterables have different lengths. Messages about labels name the view.
+        ValueError: If an option is invalid, or the backend does not support the scene. Also if labels have a wrong type
+            or size, an id is out of range, or the iterables have different lengths. Messages about labels name the
+            view.
 
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, rasterize_evidence
@@ -290,7 +295,7 @@ def render(
     settings: RasterSettings | None = None,
     dtype: torch.dtype | None = None,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """Composite values of Gaussians to sum_j A_ij values_j and sum_j A_ij of every pixel (eq. 2 of the paper).
+    """Composite values of Gaussians; return sum_j A_ij values_j and sum_j A_ij of every pixel i (eq. 2 of the paper).
 
     Args:
         scene: N Gaussians.
@@ -409,9 +414,12 @@ def _job(
             f"dtype must be torch.float32 or torch.float64, got {dtype}; for a {dtype} scene, pass dtype=torch.float32"
         )
     job = RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
-    if job.is_2d and (job.antialiased or job.settings.per_axis):
-        needed = 'rasterize_mode "classic"' if job.antialiased else "the rules of gsplat 1.4 (option gsplat_version)"
-        raise InputError(f"2D Gaussians can be drawn only with {needed}")
+    if job.is_2d and job.antialiased:
+        raise InputError('2D Gaussians need rasterize_mode "classic", got "antialiased"')
+    if job.is_2d and job.settings.per_axis:
+        raise InputError(
+            "2D Gaussians need the rules of gsplat 1.4, got those of a later version; give gsplat_version 1.4"
+        )
     return job
 
 
@@ -434,8 +442,8 @@ def _zip_views(
         for name, item in zip(("cameras", "labels", "num_regions"), items):
             if item is end:
                 raise InputError(
-                    f"{name} has only {index} entries, which is fewer than the views; give one camera and one label "
-                    "map per view, and either one number of regions per view or no num_regions"
+                    f"{name} ends after {index} view{'s' * (index != 1)}, before the other arguments; give one camera "
+                    "and one label map per view, and one number of regions per view or no num_regions"
                 )
         yield items[0], items[1], items[2] if num_regions is not None else None
 

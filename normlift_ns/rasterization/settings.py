@@ -18,6 +18,9 @@ class RasterSettings:
 
     The gsplat sources are fully_fused_projection_fwd.cu, isect_tiles.cu and rasterize_to_pixels_fwd.cu.
 
+    Raises:
+        ValueError: If a value is out of range.
+
     >>> import torch
     >>> from normlift_ns import Camera, GaussianScene, RasterSettings, render
     >>> means, quats = torch.tensor([[0.0, 0, 1]]), torch.tensor([[1.0, 0, 0, 0]])
@@ -94,7 +97,7 @@ class RasterSettings:
         """Return the constants for the entries `gsplat_rules` (default: 1.4) and `clip_planes` of a manifest.
 
         Raises:
-            ValueError: If the recorded version is unknown.
+            ValueError: If the recorded version is unknown or a plane is out of range.
 
         >>> RasterSettings.recorded({"gsplat_rules": "1.5"}).per_axis, RasterSettings.recorded({}).per_axis
         (True, False)

@@ -37,7 +37,7 @@ A view takes one byte per Gaussian and 120 bytes per visible Gaussian.
 _SAMPLE = 4096
 """Number of Gaussians that `kernel_calls` projects."""
 _SHORT = 2**15
-"""Largest number of cells in a batch that int16 can index. Sorting int16 takes half the time of int32."""
+"""Number of cells below which int16 can index the cells of a batch. Sorting int16 takes half the time of int32."""
 
 
 def check(job: RasterJob) -> None:

@@ -360,7 +360,7 @@ def _panel_width(panels: int) -> int:
 
 
 def _outlined(overlay: Tensor, selected: Tensor, width: int) -> Image.Image:
-    """Scale the overlay to at most `width` pixels, and outline the selection with a white line on a black line."""
+    """Scale the overlay to a width of at most `width` pixels, and outline the selection in white with a black edge."""
     scale = min(width / overlay.shape[1], _MAX_ASPECT * width / overlay.shape[0])
     size = (max(1, round(scale * overlay.shape[1])), max(1, round(scale * overlay.shape[0])))
     image = Image.fromarray(overlay.cpu().numpy()).resize(size, Image.Resampling.BICUBIC)
@@ -543,7 +543,8 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
     """Return training cameras by unique file name.
 
     Args:
-        names: Names from `unique_file_names`, or image paths with or without suffix (default: three views).
+        names: Names from `unique_file_names`, image paths with or without suffix, or their stems (default: names of
+            three views).
     Raises:
         ValueError: A name matches no training image, or several.
     """
@@ -642,13 +643,13 @@ def write_masks(
     settings: RasterSettings | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write one PNG mask per training image, of the same size: 255 for pixels that show the selection, 0 for others.
+    """Write one PNG mask per training image, of the same size: 255 for the pixels of `view_mask`, 0 for others.
 
     If an error occurs, no file is written. Objects in front of the selection occlude it. The masks match the
     undistorted images that the training used.
 
     Args:
-        invert: Write 0 for pixels that show the selection, and 255 for others.
+        invert: Write 0 for the pixels of `view_mask`, and 255 for others.
         settings: Rasterizer settings (default: those of gsplat 1.4).
         overwrite: Replace existing files.
     Returns:
@@ -673,7 +674,10 @@ def mask_files(scene: Scene, folder: Path) -> list[Path]:
 def view_mask(
     scene: Scene, camera: Camera, selected: Bool[Tensor, " n"], *, settings: RasterSettings | None = None
 ) -> Bool[Tensor, "h w"]:
-    """Return the mask of the pixels in which the selection contributes more than half of the opacity."""
+    """Return the mask of the pixels in which the selection contributes more than half of the opacity.
+
+    Pixels with an opacity of at most 0.05 are not in the mask.
+    """
     values = selected.to(scene.gaussians.means)[:, None]
     image, alpha = render(scene.gaussians, camera, values, rasterize_mode=scene.rasterize_mode, settings=settings)
     return pixel_relevancy(image, alpha)[:, :, 0] > 0.5

@@ -40,7 +40,10 @@ class PromptDiagnostics:
 
 
 def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagnostics, ...]:
-    """Return diagnostics of up to `max_prompts` prompts that select Gaussians; () if no prompt selects."""
+    """Return diagnostics of the first `max_prompts` prompts that define the selection.
+
+    Return () without a query, for a selection made by hand, or if no Gaussian has a direction.
+    """
     answer = state.answer
     if answer is None or not state.prompts_select:
         return ()
@@ -73,7 +76,10 @@ def _warning(finding: Finding) -> str:
 
 
 def threshold_suggestion(state: State) -> float | None:
-    """Return the threshold that the relevancies of the selecting prompts suggest; None if there is none."""
+    """Return the threshold that the relevancies of the shown prompt, or of all prompts together, suggest.
+
+    Return None without a query, or if no Gaussian has a direction.
+    """
     if state.answer is None:
         return None
     result = state.answer if state.shown is None else Finding(state.answer, state.shown)
@@ -83,7 +89,7 @@ def threshold_suggestion(state: State) -> float | None:
 def carry_threshold(state: State, question: Query) -> Query:
     """Return `question` with the threshold of the previous query, if both use the same rule.
 
-    A query of clicks alone does not pass its threshold to a query with texts, nor the reverse.
+    A query of clicks alone does not pass its threshold to a query with texts, or vice versa.
 
     If `question` uses the suggested threshold, it gets the previous threshold only if the user chose that threshold.
     """
@@ -164,14 +170,14 @@ def set_threshold(state: State, value: float) -> State:
 
 
 def use_suggested_threshold(state: State) -> State:
-    """Set the threshold that the relevancies of the selecting prompts suggest.
+    """Set the threshold of `threshold_suggestion`.
 
     Raises:
-        ValueError: The state has no query.
+        ValueError: The suggestion is None.
     """
     value = threshold_suggestion(state)
     if value is None:
-        raise InputError("This session has no query to suggest a threshold for. Type a prompt and press Ask.")
+        raise InputError("There are no relevancies to suggest a threshold from. Type a prompt and press Ask.")
     return set_threshold(state, value)
 
 
@@ -246,6 +252,8 @@ def click(state: State, weights: Float[Tensor, " n"], mode: ClickMode = "select"
 
     Args:
         weights: Weights of the Gaussians on the ray of the click, from `rasterization.rasterize.ray_weights`.
+    Raises:
+        ValueError: As in `pick_gaussian`.
     """
     return change_objects(state, object_under(state, pick_gaussian(state, weights)), mode)
 
@@ -279,6 +287,8 @@ def picked_direction(state: State, weights: Float[Tensor, " n"]) -> Float[np.nda
 
     Args:
         weights: Weights of the Gaussians on the ray of the click.
+    Raises:
+        ValueError: As in `pick_gaussian`.
     """
     row = torch.tensor([pick_gaussian(state, weights)], device=state.space.means.device)
     return state.space.field.directions(row, refined=state.refined)[0].cpu().numpy()

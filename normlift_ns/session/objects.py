@@ -72,9 +72,10 @@ class ObjectList:
 def list_objects(state: State, *, max_objects: int = 12, min_gaussians: int = OBJECT_MIN_GAUSSIANS) -> ObjectList:
     """Return the objects among the selected and drawn Gaussians, for each prompt or for a selection made by hand.
 
+    An object that was selected or added by hand stays one object, unless the selection was grown or shrunk.
+
     Args:
-        max_objects: Maximum number of listed objects; the largest object of each prompt has priority. An object that
-            was selected or added by hand stays one object, unless the selection was grown or shrunk.
+        max_objects: Maximum number of listed objects; the largest object of each prompt has priority.
         min_gaussians: Minimum number of Gaussians in an object; those in smaller components are only counted.
     """
     selected, answer = state.selection & state.drawn, state.answer

@@ -61,7 +61,7 @@ def selection_bytes(
         name: Name of the selection.
         kind: Name of an exporter that writes one file, or "masks" for a ZIP file with a mask for each training image.
     Raises:
-        ValueError: The mask has no Gaussian that a renderer draws, or the exporter does not exist.
+        ValueError: The mask has no Gaussian that a renderer draws, or the exporter does not exist or writes a folder.
     """
     if not bool(mask.any()):
         raise InputError("Nothing is selected. First select the Gaussians to export.")

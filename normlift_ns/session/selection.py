@@ -93,9 +93,9 @@ class SelectionContext:
     def grow_or_shrink(self, selected: Bool[Tensor, " n"], steps: int, *, refined: bool = True) -> Bool[Tensor, " n"]:
         """Return the selection grown (steps > 0) or shrunk (steps < 0) over the neighbor graph.
 
-        Growing adds Gaussians within `steps` edges of the selection. It also adds Gaussians that are connected to the
-        selection and similar to its mean direction. Their cosine is at least 0.95 for one step, and the limit decreases
-        by 0.05 with each further step.
+        Each step of growing adds the nearest neighbors of the selection. Growing also adds Gaussians that are connected
+        to the selection and similar to its mean direction. Their cosine is at least 0.95 for one step, and the limit
+        decreases by 0.05 with each further step.
 
         In each connected component, shrinking keeps the Gaussians whose graph distance to the middle of the component
         is at most a fraction of the largest distance. The fraction is 10/11 for one step, and decreases by 1/11 with

@@ -67,8 +67,8 @@ class Session:
 class Controller(ABC):
     """Base class for the controller of one panel, which applies actions to a session.
 
-    The controller changes the session only while it holds its lock; slow requests run without the lock. Methods may be
-    called from any thread.
+    The controller changes the history of the session only while it holds its lock; slow requests run without the lock.
+    Methods may be called from any thread.
 
     Args:
         session: Session that the actions change.
@@ -121,7 +121,7 @@ class Controller(ABC):
         self._guard(lambda: self._act(action, value, client))
 
     def show_message(self, message: str) -> None:
-        """Show a message above the size of the selection."""
+        """Show a message in the panel, above the size of the selection."""
         with self._lock:
             self._message = message
             self._update_widgets()

@@ -302,7 +302,7 @@ def _text(x: float, y: float, anchor: str, text: str) -> str:
 
 
 def diagnostics_mdx(state: State) -> str:
-    """Return the histograms and warnings of the prompts that select, as MDX; empty if no prompt selects."""
+    """Return the histograms and warnings of `diagnose_prompts` as MDX; empty if there are none."""
     diagnostics, lines = diagnose_prompts(state), []
     for one in diagnostics:
         lines += [f"{color_swatch(one.color)} {escape_mdx(clip_text(one.text, 40))}"] * (len(diagnostics) > 1)

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns import Evidence, lift, rasterize_evidence
+from normlift_ns import Evidence, consensus, lift, rasterize_evidence
 from normlift_ns.core.evidence import MASKED, Entries, _join, _join_by_sorting
 from normlift_ns.encoders.base import joint_partition
 from tests.examples import examples
@@ -46,6 +46,14 @@ def test_views_are_selected_in_the_order_asked_and_shards_give_the_whole(seed, v
     assert part.region_view.tolist() == [i for i, v in enumerate(chosen) for _ in range(VIEWS[v])]
     shards = [evidence.select_views(range(keep)), evidence.select_views(range(keep, 5))]
     assert same_evidence(Evidence.merge(*shards), evidence) and same_evidence(Evidence.merge(evidence), evidence)
+
+
+def test_fewer_gaussians_can_be_selected_than_are_excluded():
+    entries = Entries(torch.tensor([0, 0, 1, 1]), torch.tensor([1, 3, 1, 3]), torch.ones(4), (1, 1))
+    evidence = Evidence.from_entries([entries], 10, num_excluded=6)
+    assert evidence.select_gaussians(torch.tensor([0, 1])).num_excluded == 2
+    assert evidence.select_gaussians(torch.arange(10)).num_excluded == 6
+    assert consensus(evidence, torch.eye(2)).gaussians == 2
 
 
 @given(seed=SEEDS)

@@ -54,7 +54,7 @@ FACTS = {"texts": ["a"], "negatives": [], "form": "cosine", "threshold": 0.5, "m
 
 
 def damaged_question(message: str) -> Any:
-    return pytest.raises(InputError, match=rf"queries\.safetensors is damaged \(.*{message}.*--save-query True")
+    return pytest.raises(InputError, match=rf"queries\.safetensors is damaged.*{message}.*--save-query True")
 
 
 def test_a_damaged_file_says_what_to_do(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_a_damaged_file_says_what_to_do(tmp_path: Path) -> None:
         if what == "nothing":
             assert load_query(tmp_path) is None
         else:
-            with pytest.raises(InputError, match=r"queries\.safetensors is damaged"):
+            with pytest.raises(InputError, match=r"queries\.safetensors is (damaged|not a regular file)"):
                 load_query(tmp_path)
 
 

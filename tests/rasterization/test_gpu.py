@@ -13,7 +13,7 @@ import torch
 from normlift_ns import Camera, InputError, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine, render
 from normlift_ns.core import device
 from normlift_ns.rasterization import gsplat, rasterize, triton
-from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
+from normlift_ns.rasterization.rasterize import RasterJob
 from tests.captures import SHARED, needs_shared, trained_scene, training_cameras, weight_fixtures
 from tests.kernels.test_regions import hard_scene
 from tests.random_scenes import dense, generator, orbit, random_labels, random_scene, unit_rows
@@ -33,7 +33,7 @@ def compiled_gsplat() -> bool:
 
 
 @pytest.mark.parametrize("backend", ["triton", "gsplat"])
-def test_gpu_backends_refuse_other_scenes(backend):
+def test_gpu_backends_refuse_other_scenes(backend, monkeypatch):
     scene, cameras = random_scene(5, dtype=torch.float32), orbit(1)
     labels = [random_labels(cameras[0], 2)]
     for dtype in (torch.float32, torch.float64):
@@ -43,8 +43,9 @@ def test_gpu_backends_refuse_other_scenes(backend):
         with pytest.raises(ValueError, match=told):
             render(scene, cameras[0], torch.ones(5, 1), backend=backend, dtype=dtype)
     if backend == "gsplat":
-        with pytest.raises(ValueError, match=r'weight_power.* 2;.*backend="triton"'):
-            gsplat.views_evidence(replace(job(scene), weight_power=2), RasterBatch([], [], []))
+        monkeypatch.setattr(gsplat, "check_gpu", lambda *_: None)
+        with pytest.raises(ValueError, match=r'weight_power.* 2;.*backend="auto"'):
+            gsplat.check(replace(job(scene), weight_power=2))
 
 
 def job(scene, **constants):
@@ -81,7 +82,8 @@ def test_gpu_backends_draw_what_their_kernels_can(monkeypatch):
 def test_before_triton_3_a_gpu_rasterizes_with_stock_gsplat(monkeypatch):
     """A Triton without version is taken."""
     means = SimpleNamespace(device=torch.device("cuda"), is_cuda=True, dtype=torch.float32)
-    on_gpu: Any = SimpleNamespace(scene=SimpleNamespace(means=means), dtype=torch.float32)
+    scene = SimpleNamespace(means=means)
+    on_gpu: Any = SimpleNamespace(scene=scene, dtype=torch.float32, is_2d=False, weight_power=1)
     monkeypatch.setattr(rasterize, "has_triton", device.has_triton.__wrapped__)
     for installed, taken in (("3.0.0", True), ("3.6.0", True), ("", True), ("2.3.1", False), (None, False)):
 
@@ -96,6 +98,9 @@ def test_before_triton_3_a_gpu_rasterizes_with_stock_gsplat(monkeypatch):
         if not taken:
             with pytest.raises(InputError, match=r"Triton 3, .*PyTorch 2\.4"):
                 rasterize.choose_backend("triton", on_gpu)
+        for change in ({"is_2d": True}, {"weight_power": 2}):
+            job_of_torch: Any = SimpleNamespace(**{**vars(on_gpu), **change})
+            assert rasterize._fastest(job_of_torch) == ("triton" if taken else "torch"), (installed, change)
 
 
 def test_a_gpu_that_cannot_start_is_told_of_where_it_is_wanted(monkeypatch):
