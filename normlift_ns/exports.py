@@ -53,6 +53,9 @@ def semantic_columns(field: SemanticField, answer: Answer | None, instances: Ins
     """Return columns by name: reliability, n_eff, relevancy_0, … in float32, and class_id and instance_id in uint32.
 
     Ids are unsigned, with 0 for none, because splat converters turn -1 into 4294967295.
+
+    Raises:
+        ValueError: The answer has a different number of Gaussians than the field.
     """
     if answer is not None and len(answer.relevancy) != len(field):
         raise InputError(
@@ -373,7 +376,8 @@ def read_cloud(path: Path) -> PlyData:
     names = {} if vertex is None else {item.name: item for item in vertex.properties}
     if vertex is None or not set("xyz") <= set(names) or vertex.count == 0:
         count = 0 if vertex is None else vertex.count
-        raise InputError(f"{path} has {', '.join(names) or 'no properties'} of {count:,} vertices. {expected}")
+        properties = ", ".join(names) or "none"
+        raise InputError(f"{path} has {count:,} vertices with the properties: {properties}. {expected}")
     lists = [name for name, item in names.items() if hasattr(item, "len_dtype")]
     if len(lists) > 0:
         raise InputError(f"{path} has vertices with list properties ({', '.join(lists)}); remove these. {expected}")

@@ -68,7 +68,8 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
             # are ignored.
         options: Options of ns-normlift for all captures. The options of a line override them.
     Raises:
-        InputError: The file is not UTF-8 text or lists no captures, or a line is invalid or a duplicate.
+        InputError: The file is not UTF-8 text or lists no captures, `options` are invalid, or a line is invalid or a
+            duplicate.
     """
     try:
         common = _parse(options)
@@ -117,8 +118,8 @@ def is_lifted(run: Path) -> bool:
 def _capture_key(command: NormLift) -> str:
     """Return a digest of the scene and the options of a lift, 16 hexadecimal digits.
 
-    The digest includes the path of the scene, and the names and sizes of the files with its Gaussians. For folders of
-    features, label maps and weights, it includes only the paths.
+    The digest includes the path of the scene, and the name and size of the given splat file or of the checkpoint. For
+    folders of features, label maps and weights, it includes only the paths.
     """
     options = {name: value for name, value in names_of_0_2(command).items() if name not in _NOT_IN_KEY}
     options["splat"] = _splat_options_of_0_2(options["splat"])
@@ -429,7 +430,7 @@ def lift_captures(
     on_message: Callable[[str], None] = lambda text: None,
     command: Sequence[str] = LIFT_COMMAND,
 ) -> dict[str, Outcome]:
-    """Lift the captures that are neither lifted nor claimed by another worker; return the outcomes by key.
+    """Lift the captures that are neither lifted nor claimed by another worker, and wait until all captures have ended.
 
     Args:
         captures: Captures of this worker.
@@ -437,6 +438,8 @@ def lift_captures(
         timeout: Seconds without a heartbeat after which a worker counts as dead, the same for all workers.
         on_message: Callback for messages about each capture.
         command: Command of ns-normlift.
+    Returns:
+        The latest outcome of each capture with a result in the folder, by key.
     Raises:
         OSError: The folder cannot be written.
     """

@@ -19,8 +19,8 @@ KEPT_SHARE = 0.9
 The share is smaller only if too many pixels lie beyond `MAX_ANGLE`.
 """
 MAX_ANGLE = math.radians(80)
-"""Angle from the optical axis beyond which pixels are not kept. A pinhole camera cannot show directions near 90
-degrees."""
+"""Largest angle to the optical axis, in radians, of the pixels that count as kept. A pinhole camera cannot show
+directions near 90 degrees."""
 _MIN_SHARE = 0.1
 """Minimum share of pixels within `MAX_ANGLE`. If the share is smaller, the distortion is probably wrong."""
 _SAMPLES, _SAMPLING_ERROR = 512, 1e-3

@@ -165,7 +165,7 @@ def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None
 _HEAD_BYTES = 64
 _MAGIC = {b"ply": "ply", SPZ_MAGIC: "spz", GZIP_MAGIC: "spz", GLB_MAGIC: "glb"}
 _SNIFFED = {*_MAGIC.values(), "pt", "splat", "gltf"}
-"""Formats that need no suffix, because their first bytes identify them, and splat, which only its suffix identifies."""
+"""Built-in formats. The first bytes of a file decide between them, and its suffix only if the bytes match none."""
 _UNREAD = ("sog", "ksplat", "lcc", "usdz", "usd", "usda", "usdc")
 """Suffixes of unsupported formats."""
 _JSON_FORMATS = {"meta.json": "SOG", "lod-meta.json": "streamed SOG"}
@@ -263,7 +263,7 @@ def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> Splat
     """Return the file with a known primitive, from the options, the files or the file name, in this order.
 
     Raises:
-        ValueError: If options and files contradict each other.
+        ValueError: The options and the files contradict each other.
     """
     named: Primitive = "2dgs" if "2dgs" in path.name.lower() else "3dgs"
     if options.primitive is not None and file.primitive not in (None, options.primitive):
@@ -290,7 +290,9 @@ def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> Splat
 
 
 def _format(path: Path) -> str:
-    """Detect the format of a file by its first bytes, or else by its suffix; return the key of `SPLAT_READERS`.
+    """Detect the format of a file, and return the key of `SPLAT_READERS`.
+
+    The suffix decides for formats of other packages. For all other files, the first bytes decide, or else the suffix.
 
     Raises:
         ValueError: The path is a folder, or the file is not a splat or has an unsupported format.

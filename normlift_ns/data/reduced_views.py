@@ -42,7 +42,10 @@ class ReducedView(NamedTuple):
         return ReducedView(self.view.downscaled(height, width), self.divisor * divisor)
 
     def psnr(self, image: UInt8[Tensor, "h w 3"]) -> float:
-        """Return the PSNR in dB of a render, over the pixels that the mask of the view keeps."""
+        """Return the PSNR in dB of a render, over the pixels that the mask of the view keeps.
+
+        The PSNR is at most 90 dB, and 0 if the mask keeps no pixel.
+        """
         difference = (self.view.image.float() - image.float()) / 255
         if self.view.mask is not None:
             difference = difference[self.view.mask]
@@ -78,7 +81,7 @@ def sample_views(scene: Scene) -> list[ReducedView]:
     Views whose mask leaves no pixels are left out.
 
     Raises:
-        FileNotFoundError, ValueError: If an image is missing or cannot be read, or the masks leave no pixels.
+        FileNotFoundError, ValueError: An image is missing or cannot be read, or the masks leave no pixels.
     """
     last = len(scene.train) - 1
     views = [ReducedView(scene.train[index], 1.0).reduced(_MAX_SIDE) for index in sorted({0, last // 2, last})]

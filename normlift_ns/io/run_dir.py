@@ -172,7 +172,7 @@ def refuse_existing_run(run_dir: Path, overwrite: bool, source: Path | None = No
         source: File that the lift reads.
     Raises:
         FileExistsError: The directory exists, and `overwrite` is False or the directory is not a lifted run.
-        ValueError: `source` is in the directory, or the directory is part of another run.
+        ValueError: `source` is in the directory, or the errors of `refuse_inputs`.
     """
     flags = "--timestamp or --output-dir"
     refuse_inputs([run_dir], instead=flags)
@@ -313,7 +313,7 @@ def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapp
 
 
 def _ends_as_archive(path: Path) -> bool:
-    """Return whether a file has the record that ends a ZIP archive. This reads the last 66 kB only."""
+    """Return True if a file ends with the last record of a ZIP archive. Only the last 66 kB are read."""
     with open_regular(path) as file:
         return zipfile.is_zipfile(file)
 
