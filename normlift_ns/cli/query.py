@@ -541,10 +541,10 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
 def print_answer(
     rows: list[dict[str, Any]], question: Query, coordinates: Literal["scene", "capture"] = "scene"
 ) -> None:
-    """Print the table of an answer, and notes on prompts that need one.
+    """Print the table of an answer, and notes on some of its prompts.
 
-    They are prompts without a clear match, prompts that are encoded only in part, and those that select at least twice
-    as many Gaussians as at the suggested threshold.
+    These are prompts without a clear match, prompts that are encoded only in part, and prompts that select at least
+    twice as many Gaussians as at the suggested threshold.
     """
     rule = f"{question.rule} > {question.threshold:.4g}"
     narrow = common.CONSOLE.width < 100

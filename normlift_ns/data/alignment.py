@@ -44,7 +44,7 @@ class Alignment(NamedTuple):
 
     @property
     def is_usual(self) -> bool:
-        """True if the renders reach the usual PSNR and the margin."""
+        """True if `psnr` is at least `MIN_PSNR` and `margin` is at least `MIN_MARGIN`."""
         return self.psnr >= MIN_PSNR and self.margin >= MIN_MARGIN
 
 

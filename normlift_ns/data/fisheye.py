@@ -24,7 +24,7 @@ directions near 90 degrees."""
 _MIN_SHARE = 0.1
 """Minimum share of pixels within `MAX_ANGLE`. If the share is smaller, the distortion is probably wrong."""
 _SAMPLES, _SAMPLING_ERROR = 512, 1e-3
-"""Number of rows and of columns of pixels from which shares are estimated, and the error of the estimates."""
+"""Number of rows and of columns of pixels from which shares are estimated, and the maximum error of the estimates."""
 _ANGLES = np.linspace(0, math.radians(89.9), 8192)
 
 

@@ -81,7 +81,7 @@ def check_mask(mask: Path, file: Path, size: tuple[int, int]) -> None:
         size: Width and height of the image in pixels.
     Raises:
         FileNotFoundError, ValueError: As in `read_image_header`; also if the mask has the wrong channels or the wrong
-            size. The message gives both paths.
+            size, with both paths in the message.
     """
     header = read_image_header(mask)
     if header.mode not in _SINGLE_CHANNEL and not header.mode.startswith("I;16"):

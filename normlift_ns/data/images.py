@@ -382,7 +382,7 @@ def undistort_image(
     """Undistort an image, and return it with its new camera matrix.
 
     Raises:
-        ValueError: OpenCV cannot undistort the image.
+        ValueError: The distortion cannot be removed.
     """
     if not lens.is_distorted:
         return image, _matrix(lens)

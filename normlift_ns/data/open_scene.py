@@ -324,8 +324,8 @@ def open_stored_run(load_config: str | Path, data: str | Path | None = None) -> 
         load_config: Path of the config.yml of the run.
         data: Current path of the dataset, if it was moved.
     Raises:
-        FileNotFoundError, ValueError: As in `open_scene`; also if the run has no semantic field, or a field of other
-            Gaussians.
+        FileNotFoundError, ValueError: As in `open_scene` and `check_run`; also if the run has no semantic field, or a
+            field of other Gaussians.
     """
     folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
     check_run(folder)

@@ -21,7 +21,7 @@ _MAX_DIVISOR_AS_TRAINED = 4.0
 """Limit on the divisor of the image size for renders in the trained mode.
 
 Below the limit, a render uses the trained mode, and the rasterizer's blur of 0.3 square pixels is scaled down. Other
-renders are antialiased, which preserves the mean of Gaussians smaller than a pixel.
+renders are antialiased, so that the blur does not add opacity to Gaussians smaller than a pixel.
 """
 _SMALL_EPS2D = 0.1
 """Variance in square pixels that the antialiased renders add to projected Gaussians."""

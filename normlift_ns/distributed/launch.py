@@ -176,7 +176,8 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
         log: Callback for messages about a long wait for other processes, and about a lost process that no other process
             reports.
     Raises:
-        InputError: The processes cannot connect, the machine has too few GPUs, or the errors of `rank_and_world_size`.
+        InputError: The processes cannot connect, or the machine has too few GPUs. Also the errors of
+            `rank_and_world_size`.
         SystemExit: Another process failed or is lost. The exit code is 1.
     """
     ranks = rank_and_world_size(os.environ)

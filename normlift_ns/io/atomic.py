@@ -300,8 +300,8 @@ def atomic_files(
         own: Skip the checks of inputs and kinds, for files of runs and caches that this package wrote itself.
     Raises:
         FileExistsError: A path exists, and `overwrite` is False.
-        ValueError: The errors of `refuse_inputs`. With `overwrite`, also if an existing file has the content of a
-            different kind. No file has changed.
+        ValueError: The errors of `refuse_inputs`. With `overwrite`, also if an existing file is of a different kind. No
+            file has changed.
         NotWrittenError: Writing failed, for instance because the disk is full. No file has changed.
 
     >>> import tempfile

@@ -116,7 +116,7 @@ def recorded_gsplat_version(run_dir: Path) -> str | None:
 
 
 def resolve_manifest_paths(manifest: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
-    """Return a manifest in which the path of the text embeddings starts with `folder`, the folder of the manifest."""
+    """Return a manifest whose relative path of text embeddings, if any, is joined to `folder`, the manifest's folder."""
     encoder = manifest.get("encoder")
     if not isinstance(encoder, dict) or encoder.get("text_vectors") is None:
         return manifest
@@ -211,7 +211,7 @@ def written_files(run_dir: Path) -> set[str]:
 
 
 class _Metadata(msgspec.Struct):
-    """Entries of a manifest that programs read; all other entries are for people."""
+    """Entries of a manifest whose types are checked."""
 
     num_gaussians: _Count
     dimension: _Count
