@@ -221,7 +221,7 @@ def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
         ValueError: The file is truncated or damaged, or contains other Python objects.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist. Expected a file written by torch.save; {advice}.")
+        raise FileNotFoundError(f"The file {path} does not exist. Expected a file written by torch.save; {advice}.")
     check_regular(path)
     _check_archive(path, advice)
     try:

@@ -303,7 +303,7 @@ def _format(path: Path) -> str:
     suffix = suffix.lower()
     head = b""
     if path.is_dir():
-        raise InputError(f"{path} is a folder, expected the file of a splat. Give a file in it.")
+        raise InputError(f"{path} is a folder, expected the file of a splat. Give the path of the file.")
     if path.is_file():
         with open_regular(path) as file:
             head = file.read(_HEAD_BYTES)

@@ -206,7 +206,7 @@ def _read_zstd(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
     """Return the header and the attributes of version 4."""
     header = _read_header(data, path)
     if header.version != 4 or len(data) < _TABLE_OFFSET.size:
-        raise _damaged(path, f"its header is not compressed, but has version {header.version} or is too short")
+        raise _damaged(path, f"its uncompressed header has version {header.version}, expected 4, or is too short")
     _check_size(header, len(data) * 64, path)  # zstd can reach a higher compression ratio than deflate
     (start,), number = _TABLE_OFFSET.unpack_from(data), data[_HEADER.size - 1]
     sizes = [size for size in header.sizes if size > 0]
