@@ -33,7 +33,7 @@ from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.io import file_lock
 from normlift_ns.io.atomic import safe_file_name, text_digest
 from normlift_ns.io.guard import read_file, read_text
-from normlift_ns.io.run_dir import FIELD_FOLDER, read_manifest, run_directory
+from normlift_ns.io.run_dir import FIELD_FOLDER, LIFT_AGAIN, read_manifest, run_directory
 from normlift_ns.options import CheckedOptions, names_of_0_2, short_repr
 
 _PREFIX = "batch_"
@@ -68,6 +68,7 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
             # are ignored.
         options: Options of ns-normlift for all captures. The options of a line override them.
     Raises:
+        FileNotFoundError: The file does not exist.
         InputError: The file is not UTF-8 text or lists no captures, `options` are invalid, or a line is invalid or a
             duplicate.
     """
@@ -111,7 +112,8 @@ def is_lifted(run: Path) -> bool:
     try:
         read_manifest(run / FIELD_FOLDER)
     except (InputError, OSError) as error:
-        raise InputError(f"{error}. To lift the capture again, delete {run} and rerun the command.") from error
+        problem = str(error).removesuffix(f"; {LIFT_AGAIN}")
+        raise InputError(f"{problem}. To lift the capture again, delete {run} and rerun the command.") from error
     return True
 
 

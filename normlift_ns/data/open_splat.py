@@ -54,8 +54,8 @@ def open_splat(
         say: Function that is called with a message for each assumption, for example `print`.
     Raises:
         FileNotFoundError: A file or image is missing.
-        ValueError: A file cannot be read, does not match the others, or is not a splat.
-        TypeError: An argument has the wrong type.
+        ValueError: A file cannot be read, does not match the others, or is not a splat. Also if `path` is not a path.
+        TypeError: Another argument has the wrong type.
 
     >>> from normlift_ns import SplatOptions, open_run, open_splat
     >>> run = open_run(config)
@@ -65,10 +65,6 @@ def open_splat(
     >>> len(scene.gaussians) == len(rows), len(scene.train)
     (True, 12)
     """
-    if not isinstance(path, str | Path) or not isinstance(options, SplatOptions):
-        raise TypeError(
-            f"open_splat takes a path and SplatOptions, got {type(path).__name__} and {type(options).__name__}"
-        )
     path = Path(path).absolute()
     cameras = read_camera_file(options)
     file = _with_primitive(_read(path), path, options)

@@ -63,9 +63,9 @@ def encode_spz(
     """Encode Gaussians as an SPZ file, in the order of their rows and in their own coordinates.
 
     Positions are rounded to multiples of a power of two, the smallest from 2^-23 to 1 for which all fit into 24 bits.
-    Logarithms of scales are rounded to 1/16 and clamped to -10..5.94. Opacities are rounded to 1/255, and colors to
-    1/38. Rotations change by at most 0.005 radians. Spherical harmonics are rounded to 1/16 (degree 1) or 1/8, and
-    clamped to -1..1. Gaussians that are never drawn get opacity 0.
+    Logarithms of scales are rounded to 1/16 and clamped to -10..5.94. Opacities are rounded to 1/255. Constant
+    spherical harmonics are rounded to 1/38 and clamped to -3.33..3.33, others to 1/16 (degree 1) or 1/8 and -1..1.
+    Rotations change by at most 0.005 radians. Gaussians that are never drawn get opacity 0.
 
     Args:
         splat: Gaussians to encode.
@@ -186,7 +186,10 @@ def _damaged(path: Path, problem: str) -> InputError:
 
 
 def _read_gzip(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
-    """Return the header and the attributes of version 2 or 3; never decompress more bytes than the header declares."""
+    """Return the header and the attributes of version 2 or 3.
+
+    The function decompresses at most one byte more than the header declares.
+    """
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         header = _read_header(stream.decompress(data, _HEADER.size), path)
@@ -194,10 +197,13 @@ def _read_gzip(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
             raise _damaged(path, "it is compressed like version 3, but its header has version 4")
         _check_size(header, len(data), path)
         content = stream.decompress(stream.unconsumed_tail, sum(header.sizes))
+        rest = stream.decompress(stream.unconsumed_tail, 1)  # zlib checks the CRC at the end, unless extensions follow
     except zlib.error as error:
         raise _damaged(path, str(error)) from error
     if len(content) < sum(header.sizes):
         raise _damaged(path, f"it ends after {len(content):,} of {sum(header.sizes):,} bytes")
+    if len(rest) == 0 and not stream.eof:
+        raise _damaged(path, "it ends before its checksum")
     ends = np.cumsum(header.sizes).tolist()
     return header, [content[end - size : end] for end, size in zip(ends, header.sizes)]
 

@@ -52,7 +52,7 @@ def file_digest(*files: Path, compare_to: str = "") -> str:
         compare_to: Digest that the caller compares with the result. For a digest of version 0.1, the function uses the
             hash of that version, which is much slower.
     Raises:
-        OSError: A file cannot be read.
+        OSError, ValueError: A file does not exist, cannot be read, or is not a regular file.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "a.txt"

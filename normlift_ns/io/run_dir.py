@@ -116,7 +116,7 @@ def recorded_gsplat_version(run_dir: Path) -> str | None:
 
 
 def resolve_manifest_paths(manifest: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
-    """Return a manifest in which a relative path of text embeddings is joined to `folder`, the folder of the manifest."""
+    """Return a manifest in which a relative path of text embeddings is joined to `folder`, the manifest's folder."""
     encoder = manifest.get("encoder")
     if not isinstance(encoder, dict) or encoder.get("text_vectors") is None:
         return manifest
