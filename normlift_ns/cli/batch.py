@@ -522,7 +522,8 @@ class NormLiftBatch(CheckedOptions):
     options: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[-- OPTIONS, at the end]")] = ()
     """Options of ns-normlift that apply to all captures, given after --."""
     results: Path | None = None
-    """Folder for results, logs and claims, which all workers share. None: <name of the list>_batch next to the list."""
+    """Folder for results, logs and claims, which all workers share. None: a folder next to the list, such
+    as captures_batch for captures.txt."""
     shard: str = "auto"
     """Part of the list that this worker lifts. i/n: the i-th of n parts. none: all captures that no other worker has
     claimed. auto: the part that the variables of a SLURM job array, or RANK and WORLD_SIZE,
