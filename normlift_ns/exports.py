@@ -363,7 +363,8 @@ def read_cloud(path: Path) -> PlyData:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is truncated or not a PLY file, or its vertices have list properties or no positions.
+        ValueError: The file is truncated or not a PLY file, has no vertices, or has vertices with list properties or
+            without positions.
     """
     expected = "Expected a point cloud or mesh in PLY format whose vertices have x, y and z."
     if not path.is_file():

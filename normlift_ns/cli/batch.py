@@ -33,7 +33,7 @@ from normlift_ns.errors import InputError, escape_unprintable
 from normlift_ns.io import file_lock
 from normlift_ns.io.atomic import safe_file_name, text_digest
 from normlift_ns.io.guard import read_file, read_text
-from normlift_ns.io.run_dir import FIELD_FOLDER, read_manifest, run_directory
+from normlift_ns.io.run_dir import FIELD_FOLDER, LIFT_AGAIN, read_manifest, run_directory
 from normlift_ns.options import CheckedOptions, names_of_0_2, short_repr
 
 _PREFIX = "batch_"
@@ -68,7 +68,9 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
             # are ignored.
         options: Options of ns-normlift for all captures. The options of a line override them.
     Raises:
-        InputError: The file is not UTF-8 text or lists no captures, or a line is invalid or a duplicate.
+        FileNotFoundError: The file does not exist.
+        InputError: The file is not UTF-8 text or lists no captures, `options` are invalid, or a line is invalid or a
+            duplicate.
     """
     try:
         common = _parse(options)
@@ -110,15 +112,16 @@ def is_lifted(run: Path) -> bool:
     try:
         read_manifest(run / FIELD_FOLDER)
     except (InputError, OSError) as error:
-        raise InputError(f"{error}. To lift the capture again, delete {run} and rerun the command.") from error
+        problem = str(error).removesuffix(f"; {LIFT_AGAIN}")
+        raise InputError(f"{problem}. To lift the capture again, delete {run} and rerun the command.") from error
     return True
 
 
 def _capture_key(command: NormLift) -> str:
     """Return a digest of the scene and the options of a lift, 16 hexadecimal digits.
 
-    The digest includes the path of the scene, and the names and sizes of the files with its Gaussians. For folders of
-    features, label maps and weights, it includes only the paths.
+    The digest includes the path of the scene, and the name and size of the given splat file or of the checkpoint. For
+    folders of features, label maps and weights, it includes only the paths.
     """
     options = {name: value for name, value in names_of_0_2(command).items() if name not in _NOT_IN_KEY}
     options["splat"] = _splat_options_of_0_2(options["splat"])
@@ -429,7 +432,7 @@ def lift_captures(
     on_message: Callable[[str], None] = lambda text: None,
     command: Sequence[str] = LIFT_COMMAND,
 ) -> dict[str, Outcome]:
-    """Lift the captures that are neither lifted nor claimed by another worker; return the outcomes by key.
+    """Lift the captures that are neither lifted nor claimed by another worker, and wait until all captures have ended.
 
     Args:
         captures: Captures of this worker.
@@ -437,6 +440,8 @@ def lift_captures(
         timeout: Seconds without a heartbeat after which a worker counts as dead, the same for all workers.
         on_message: Callback for messages about each capture.
         command: Command of ns-normlift.
+    Returns:
+        The latest outcome of each capture with a result in the folder, by key.
     Raises:
         OSError: The folder cannot be written.
     """
@@ -517,7 +522,8 @@ class NormLiftBatch(CheckedOptions):
     options: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[-- OPTIONS, at the end]")] = ()
     """Options of ns-normlift that apply to all captures, given after --."""
     results: Path | None = None
-    """Folder for results, logs and claims, which all workers share. None: <name of the list>_batch next to the list."""
+    """Folder for results, logs and claims, which all workers share. None: a folder next to the list, such
+    as captures_batch for captures.txt."""
     shard: str = "auto"
     """Part of the list that this worker lifts. i/n: the i-th of n parts. none: all captures that no other worker has
     claimed. auto: the part that the variables of a SLURM job array, or RANK and WORLD_SIZE,

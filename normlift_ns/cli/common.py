@@ -298,7 +298,7 @@ def run_command_process(command: type[CommandProtocol]) -> NoReturn:
 
 
 _process_starts: list[float] = []
-"""At most one value of `time.perf_counter`, that of the start of the command's process. Functions add none."""
+"""Start of the command's process as a value of `time.perf_counter`; empty if the command is called as a function."""
 
 
 def command_start() -> float:
@@ -373,7 +373,7 @@ def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | N
 
 @contextmanager
 def _legible_help() -> Iterator[None]:
-    """Print help with at least 40 columns, because tyro's layout does not terminate with fewer."""
+    """Print help with at least 40 columns, because tyro never finishes a layout with fewer."""
     columns = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = str(max(40, shutil.get_terminal_size().columns))
     try:

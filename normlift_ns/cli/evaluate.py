@@ -173,7 +173,7 @@ class NormLiftEval(CheckedOptions):
             )
 
     def _protocol(self, runs: Iterable[EvaluatedRun]) -> tuple[Evaluate, Callable[[Sequence[EvaluatedRun]], list[Row]]]:
-        """Return a function that scores runs, and a function that measures the signals of R."""
+        """Return a function that scores runs, and a function for --study signals."""
         from normlift_ns.evaluation import lerf, protocols, scannet, studies  # noqa: PLC0415 (--help should not wait for torch)
         from normlift_ns.evaluation.options import Evaluation  # noqa: PLC0415
 

@@ -109,7 +109,7 @@ class NormLiftQuery(CheckedOptions):
     box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z. Both span the
     1st to 99th percentile. R is the mean reliability. views counts the training images that show the object with at
     least a tenth of its largest visible area. best views has up to three of them: first those with the whole object,
-    then others, both sorted by how much of the object they show. If there are more than 40 objects, the table lists
+    then others, both sorted by the area of the object in the image. If there are more than 40 objects, the table lists
     only the 10 largest, and a line below counts the objects of each prompt."""
     objects_dir: Path | None = None
     """Folder for the list of --objects or --inventory in capture and scene coordinates, with the axes of the boxes. The
@@ -301,7 +301,7 @@ class NormLiftQuery(CheckedOptions):
 
         run, answer = self._run, self._answer_with_scene(question)
         instances = objects.find_instances(answer.texts, answer.means, answer.relevancy, answer.selected)
-        transform, device = objects.similarity_to_capture(run.folder, run.scene.identity), choose_device("auto")
+        transform, device = objects.similarity_to_capture(run.folder, run.scene.identity), choose_device(self.device)
         catalog = objects.make_catalogue(
             run.scene, run.field, instances, transform, meters_per_unit=self.meters_per_unit, device=device
         )
@@ -441,7 +441,7 @@ def run_repl(
     keep_history: bool,
     coordinates: Literal["scene", "capture"] = "scene",
 ) -> None:
-    """Answer the prompts that a user types, until `exit` or Ctrl-D. Print an error for invalid prompts.
+    """Answer the prompts that a user types, until `exit`, `quit` or Ctrl-D. Print an error for invalid prompts.
 
     Args:
         run: Lifted run.
@@ -501,7 +501,7 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         rules: Keyword arguments of `QuickRun.ask`.
         lines: Prompts in UTF-8. If None, read standard input.
     Raises:
-        ValueError: Some prompts failed. The JSON line of each has the key `error`.
+        ValueError: Standard output is closed, or some prompts failed. The JSON line of each has the key `error`.
     """
     stdin: Any = sys.stdin  # None if it is closed
     source: Iterable[bytes] = (() if stdin is None else stdin.buffer) if lines is None else lines
@@ -541,10 +541,10 @@ def _write_arrays(path: Path, result: Answer, extra: dict[str, Any], overwrite: 
 def print_answer(
     rows: list[dict[str, Any]], question: Query, coordinates: Literal["scene", "capture"] = "scene"
 ) -> None:
-    """Print the table of an answer, and notes on prompts that need one.
+    """Print the table of an answer, and notes on some of its prompts.
 
-    They are prompts without a clear match, prompts that are encoded only in part, and those that select at least twice
-    as many Gaussians as at the suggested threshold.
+    These are prompts without a clear match, prompts that are encoded only in part, and prompts that select at least
+    twice as many Gaussians as at the suggested threshold.
     """
     rule = f"{question.rule} > {question.threshold:.4g}"
     narrow = common.CONSOLE.width < 100

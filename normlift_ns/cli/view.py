@@ -31,7 +31,7 @@ class ServeOptions(CheckedOptions):
     """Further host names under which browsers may open the page, such as that of a proxy. The server answers requests
     under other names with status 403."""
     port: int = 7008
-    """Port to listen on, in 1..65535. If it is in use, the server takes the next free port."""
+    """Port to listen on, in 1..65535. If it is in use, the server takes the first free one of the next 99 ports."""
     read_only: bool = False
     """Prevent visitors from storing prompts in the run."""
     max_gaussians: int = 1_000_000

@@ -1,1 +1,1 @@
-"""Readers of trained splats and their training images. Together, they open a `Scene` of the core."""
+"""Readers of trained splats and their training images, which make them available as a `core.scene.Scene`."""

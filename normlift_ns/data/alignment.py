@@ -20,10 +20,10 @@ from normlift_ns.rasterization.settings import RasterSettings
 MIN_PSNR = 24.0
 """Usual minimum PSNR in dB. Real scenes reach 25 to 40 dB on their training images."""
 MIN_MARGIN = 3.0
-"""Minimum lead in dB over the PSNR of the images' mean color. In `python -m research.worlds`, cameras in a wrong world
-have less. Cameras in the right world have at least 1 dB more than the minimum."""
+"""Minimum `Alignment.margin` in dB. In `python -m research.worlds`, the margin is smaller for cameras in a wrong world,
+and at least 4 dB for cameras in the right world."""
 _MIN_VISIBLE = 0.001
-"""Minimum fraction of all Gaussians that at least one view contains."""
+"""Minimum `Alignment.visible_fraction`."""
 
 
 class Alignment(NamedTuple):
@@ -44,7 +44,7 @@ class Alignment(NamedTuple):
 
     @property
     def is_usual(self) -> bool:
-        """True if the renders reach the usual PSNR and the margin."""
+        """True if `psnr` is at least `MIN_PSNR` and `margin` is at least `MIN_MARGIN`."""
         return self.psnr >= MIN_PSNR and self.margin >= MIN_MARGIN
 
 
@@ -100,7 +100,8 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
         match: Result of `measure_alignment`.
         trained_cameras: True if, according to the files, the splat was trained with these cameras.
     Raises:
-        ValueError: The Gaussians and the cameras do not belong together.
+        ValueError: The views contain almost no Gaussians. Also if the margin is below `MIN_MARGIN` and
+            `trained_cameras` is False.
     """
     causes = "Likely causes: " + (
         "the images, their exposure or the cameras have changed since the training, or the training was stopped early"

@@ -22,7 +22,8 @@ def read_antimatter(path: Path) -> SplatFile:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is empty, its size is not a multiple of 32 bytes, or the Gaussians cannot be rendered.
+        ValueError: The file is empty, its size is not a multiple of 32 bytes, a scale is negative, or the Gaussians
+            cannot be rendered.
     """
     if not path.is_file():
         raise FileNotFoundError(f"The .splat file {path} does not exist. Give an existing file with --load-ply.")
@@ -47,7 +48,7 @@ def read_antimatter(path: Path) -> SplatFile:
     )
     validate_splat(splat, path)
     rounding = (
-        f"{path.name} contains rounded numbers. Maximum errors: 0.02 radians for rotations, and 0.002 for opacities "
+        f"{path.name} contains rounded numbers. Maximum errors: 0.04 radians for rotations, and 0.004 for opacities "
         "and colors."
     )
     return SplatFile(splat, remarks=(rounding,))

@@ -27,7 +27,7 @@ def read_camera_file(options: SplatOptions, advice: str | None = None) -> Camera
         advice: Advice on missing images, for error messages; None for advice that depends on the options.
     Raises:
         FileNotFoundError: A file, folder, image or mask is missing.
-        ValueError: The options do not contain exactly one camera file, or it cannot be read.
+        ValueError: The options do not contain exactly one camera file, or this file, an image or a mask is not valid.
     """
     count = (options.colmap is not None) + (options.transforms is not None)
     if count != 1:

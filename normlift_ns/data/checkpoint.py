@@ -137,9 +137,9 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
         return checkpoints[max(checkpoints)]
     if step not in checkpoints:
         raise FileNotFoundError(
-            f"{folder} has no checkpoint of step {step}, but of the steps "
-            f"{', '.join(map(str, sorted(checkpoints)))}. Give one of them with --load-step, or omit --load-step for "
-            "the last step."
+            f"{folder} has no checkpoint of step {step}, only checkpoints of the steps "
+            f"{', '.join(map(str, sorted(checkpoints)))}. Give one of these steps with --load-step, or omit "
+            "--load-step to use the last one."
         )
     return checkpoints[step]
 
@@ -221,7 +221,7 @@ def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
         ValueError: The file is truncated or damaged, or contains other Python objects.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist. Expected a file written by torch.save; {advice}.")
+        raise FileNotFoundError(f"The file {path} does not exist. Expected a file written by torch.save; {advice}.")
     check_regular(path)
     _check_archive(path, advice)
     try:
@@ -241,7 +241,7 @@ def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
 
 
 def _check_archive(path: Path, advice: str) -> None:
-    """Raise InputError unless the sizes and CRC-32 checksums of a file of torch.save are valid.
+    """Raise InputError unless a file is a ZIP archive with valid sizes and CRC-32 checksums, as torch.save writes it.
 
     torch.load does not check them. Compressed entries are invalid, because torch.save never compresses.
     """

@@ -53,13 +53,13 @@ _ADVICE = "Copy the reconstruction again, or rewrite it with: colmap model_conve
 def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: None) -> Path:
     """Return the folder of a COLMAP reconstruction: the given folder, or a subfolder such as sparse/0.
 
-    If there are several reconstructions, return the one with the most images.
+    If the folder itself is not a reconstruction, and several subfolders are, return the one with the most images.
 
     Args:
         folder: Folder of the project or of the reconstruction.
-        say: Function that is called with a message if there are several reconstructions.
+        say: Function that is called with a message if several subfolders are reconstructions.
     Raises:
-        FileNotFoundError: The folder does not exist, or none of these folders contains a reconstruction.
+        FileNotFoundError: The folder does not exist, or neither it nor one of the subfolders is a reconstruction.
     """
     if not folder.is_dir():
         raise FileNotFoundError(
@@ -137,7 +137,7 @@ def read_colmap_model(model: Path, *, text_first: bool = False) -> tuple[dict[in
         text_first: True to prefer text files, as nerfstudio does; False to prefer binary files, as COLMAP does.
     Raises:
         FileNotFoundError: A file is missing.
-        ValueError: A file is damaged, or contains duplicate IDs, invalid image sizes, poses that are not finite, no
+        ValueError: A file is damaged, or contains duplicate IDs, invalid image sizes, camera parameters or poses, no
             images, or an image without its camera.
     """
     as_text = text_first and (model / "cameras.txt").exists()
@@ -232,7 +232,8 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
         advice: Advice on missing images, for error messages.
     Raises:
         FileNotFoundError: The reconstruction, an image or a mask is missing.
-        ValueError: As in `read_colmap_model` and `colmap_intrinsics`. Also if text and binary files differ.
+        ValueError: As in `read_colmap_model` and `colmap_intrinsics`. Also if text and binary files differ, or two
+            images share a file or a mask.
     """
     remarks: list[str] = []
     model = find_colmap_model(folder, remarks.append)
@@ -279,8 +280,9 @@ def _check_formats(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapI
     if len(differ) > 0:
         raise InputError(
             f"{model} can be read in two ways: the cameras of {differ[0]} in the .bin and .txt files differ "
-            f"({len(differ)} of {len(first)} images). COLMAP and gsplat read the .bin files; nerfstudio reads the .txt "
-            f"files. Keep only those that the splat was trained with: rm {model / '*.txt'}, or rm {model / '*.bin'}"
+            f"({len(differ)} of {len({**first, **second})} images). COLMAP and gsplat read the .bin files; nerfstudio "
+            "reads the .txt files. Keep only those that the splat was trained with: "
+            f"rm {model / '*.txt'}, or rm {model / '*.bin'}"
         )
 
 

@@ -19,7 +19,8 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
 
 _MAX_SHIFT, _MAX_ROTATION = 1e-3, 0.1
-"""Tolerances for known cameras: shift as a fraction of the extent of all cameras, and rotation in degrees."""
+"""Tolerances for known cameras: shift relative to their largest distance from their mean position, and rotation in
+degrees."""
 
 
 def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None) -> AnyScene:
@@ -33,8 +34,8 @@ def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None)
         cameras: Folder of a COLMAP project, or a transforms.json, with old and new images.
         images: Folder of the images; if None, the default of `SplatOptions.images`.
     Raises:
-        FileNotFoundError, ValueError: As in `open_splat`. Also if no image is new, fewer than two images are known, or
-            known cameras have moved relative to each other.
+        FileNotFoundError, ValueError: As in `read_camera_file` and `with_frames`. Also if no image is new, fewer than
+            two images are known, or known cameras have moved relative to each other.
     """
     path = cameras.absolute()
     is_transforms = path.suffix == ".json" or (path / "transforms.json").is_file()

@@ -19,12 +19,12 @@ KEPT_SHARE = 0.9
 The share is smaller only if too many pixels lie beyond `MAX_ANGLE`.
 """
 MAX_ANGLE = math.radians(80)
-"""Angle from the optical axis beyond which pixels are not kept. A pinhole camera cannot show directions near 90
-degrees."""
+"""Largest angle to the optical axis, in radians, of the pixels that count as kept. A pinhole camera cannot show
+directions near 90 degrees."""
 _MIN_SHARE = 0.1
 """Minimum share of pixels within `MAX_ANGLE`. If the share is smaller, the distortion is probably wrong."""
 _SAMPLES, _SAMPLING_ERROR = 512, 1e-3
-"""Number of rows and of columns of pixels from which shares are estimated, and the error of the estimates."""
+"""Number of rows and of columns of pixels from which shares are estimated, and the maximum error of the estimates."""
 _ANGLES = np.linspace(0, math.radians(89.9), 8192)
 
 

@@ -31,9 +31,9 @@ class ImageHeader(NamedTuple):
     mode: str
     """Pillow's name of the pixel format."""
     rotated: bool
-    """True if the EXIF data contain a rotation, which training ignores."""
+    """True if the EXIF data contain a rotation or a reflection, which training ignores."""
     multi_frame: bool
-    """True if the file contains several images, of which only the first is read."""
+    """True if the file contains several images, of which only the first is read; always False for the format MPO."""
 
 
 def read_image_header(file: Path) -> ImageHeader:
@@ -81,7 +81,7 @@ def check_mask(mask: Path, file: Path, size: tuple[int, int]) -> None:
         size: Width and height of the image in pixels.
     Raises:
         FileNotFoundError, ValueError: As in `read_image_header`; also if the mask has the wrong channels or the wrong
-            size. The message gives both paths.
+            size, with both paths in the message.
     """
     header = read_image_header(mask)
     if header.mode not in _SINGLE_CHANNEL and not header.mode.startswith("I;16"):
@@ -127,7 +127,7 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 _ROTATION_TOLERANCE = 1e-3
-"""Maximum deviation of a rotation from an orthonormal matrix; numbers in files are rounded."""
+"""Maximum absolute value in R R^T - I for a rotation matrix R; numbers in files are rounded."""
 GIVE_IMAGES = "give the folder of the images with --images"
 """Advice on missing images if the options do not contain their folder."""
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -262,7 +262,7 @@ def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *
         folder: Folder to search.
         source: Path of the camera file, for error messages.
         advice: Advice on missing images, for error messages.
-        allow_copies: True if the folder may contain copies of the images, also in other subfolders.
+        allow_copies: True if the folder may contain copies of the images, with leading folders of their paths missing.
     Raises:
         FileNotFoundError: Images are missing. The message gives their number and the first of them.
         ValueError: Two names lead to the same file.
@@ -310,7 +310,7 @@ def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Pat
 
 
 def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
-    """Return the first existing file of `possible_paths`, or None; the file may have another suffix."""
+    """Return the first existing file of `possible_paths`, or None. Its suffix may be another one or an added one."""
     for candidate in possible_paths(folder, name, copies=copies):
         for file in (
             *(candidate.with_name(candidate.name + suffix) for suffix in ("", *_SUFFIXES)),

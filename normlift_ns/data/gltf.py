@@ -150,7 +150,8 @@ def _placed(gltf: _Gltf, mesh: int, file: SplatFile) -> SplatFile:
 
 
 def _world_transform(gltf: _Gltf, mesh: int) -> WorldTransform:
-    """Return the transform from a mesh to its scene; raise InputError for several instances, or if it shears."""
+    """Return the transform from a mesh to its scene; raise InputError for several instances, or for a transform that is
+    not a similarity."""
     path, nodes, matrix = gltf.path, gltf.document.nodes, np.eye(4)
     holders = [number for number, node in enumerate(nodes) if node.mesh == mesh]
     if len(holders) > 1 or any(_INSTANCING in nodes[number].extensions for number in holders):

@@ -39,7 +39,7 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     Returns:
         The settings, or None without a cfg.yml of gsplat's trainer.
     Raises:
-        ValueError: If the file is damaged, or the splat was not trained as 3D or 2D Gaussians with pinhole cameras.
+        ValueError: The file is damaged, or the splat was not trained as 3D or 2D Gaussians with pinhole cameras.
     """
     folder = splat.parent.parent if splat.parent.name in _FOLDERS else splat.parent
     path = next((folder / name for name in _NAMES if (folder / name).is_file()), None)

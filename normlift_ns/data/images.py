@@ -146,7 +146,7 @@ class SplitViews:
     Args:
         files: Paths of the images.
         names: Paths of the images relative to the dataset.
-        masks: One path per image, or None for images without a mask.
+        masks: One path per image, with None for an image without a mask; None if no image has a mask.
         sizes: Width and height of the cameras in pixels, before undistortion.
         poses: Camera-to-world poses [V, 3, 4] in OpenGL convention, from the dataset or optimized by the training.
         background: RGB in 0..1, blended behind images with an alpha channel.
@@ -382,7 +382,7 @@ def undistort_image(
     """Undistort an image, and return it with its new camera matrix.
 
     Raises:
-        ValueError: OpenCV cannot undistort the image.
+        ValueError: The distortion cannot be removed.
     """
     if not lens.is_distorted:
         return image, _matrix(lens)
@@ -428,7 +428,7 @@ def label_undistortion(*parts: Views) -> Callable[[str, np.ndarray], np.ndarray]
 
 
 def filled_function(views: Views) -> Callable[[str, int, int], Bool[Tensor, "h w"]] | None:
-    """Return a function that masks the pixels that the original image shows, given an image name, a height and a width.
+    """Return a function from an image name, a height and a width to a mask of the pixels that the original image shows.
 
     The result is None unless the views are `ImageViews` with fisheye cameras.
     """

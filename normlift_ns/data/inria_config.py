@@ -30,7 +30,7 @@ def find_inria_config(splat: Path) -> InriaConfig | None:
     Returns:
         The settings, or None without a cfg_args of Inria's trainer. Missing settings have the trainer's defaults.
     Raises:
-        ValueError: If the file is damaged.
+        ValueError: The file is damaged.
     """
     folder = splat.parents[2] if len(splat.parents) > 2 and splat.parents[1].name == "point_cloud" else splat.parent
     path = folder / _NAME

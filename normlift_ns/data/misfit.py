@@ -52,7 +52,7 @@ class _Pair(NamedTuple):
     """An image and a render of the same size. Both are blurred, because interpolation for a lens blurs the image."""
 
     image: Float[Tensor, "1 4 h w"]
-    """RGB in 0..1, and 1 at pixels that count."""
+    """RGB in 0..1, and the unmasked fraction of the pixel's blur window."""
     render: Float[Tensor, "1 3 h w"]
     focal: tuple[float, float]
     center: tuple[float, float]

@@ -47,7 +47,7 @@ class SplatScene:
     held_out: ImageViews
     name: str
     checkpoint_path: Path
-    """Path of the splat file, of the first gsplat checkpoint, or of the checkpoint of a lifted run."""
+    """Path of the splat file or gsplat checkpoint that was given, or of the checkpoint of a lifted run."""
     step: int
     """Training step; 0 if unknown."""
     runs_dir: Path
@@ -59,8 +59,8 @@ class SplatScene:
     remarks: tuple[str, ...] = ()
     """Warnings about the images, in whole sentences."""
     alignment: Alignment | None = None
-    """Agreement of renders by the rules of gsplat 1.4 with the images; None unless the search for the world measured
-    it."""
+    """Agreement of renders by the rules of gsplat 1.4 with the images; None unless the search for the world found one
+    that fits."""
 
     renderer = None
     """Renderer of another package; None, because `normlift_ns` renders this scene."""
@@ -213,7 +213,7 @@ class _ConcatenatedViews:
 
     def __getitem__(self, index: int, /) -> View:
         if not -len(self) <= index < len(self):
-            raise IndexError(f"view {index} of {len(self)}")
+            raise IndexError(f"view {index} does not exist; the number of views is {len(self)}")
         index %= len(self)
         first = self._first
         return first[index] if index < len(first) else self._second[index - len(first)]
@@ -324,8 +324,8 @@ def open_stored_run(load_config: str | Path, data: str | Path | None = None) -> 
         load_config: Path of the config.yml of the run.
         data: Current path of the dataset, if it was moved.
     Raises:
-        FileNotFoundError, ValueError: As in `open_scene`; also if the run has no semantic field, or a field of other
-            Gaussians.
+        FileNotFoundError, ValueError: As in `open_scene` and `check_run`; also if the run has no semantic field, or a
+            field of other Gaussians.
     """
     folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
     check_run(folder)
@@ -349,7 +349,7 @@ def _changed_cameras(field: SemanticField, scene: Scene) -> list[str]:
     if len(changed) == 0:
         return []
     return [
-        f"the {' and '.join(changed)} cameras of {scene.name} have changed since the lift. Query results still use the "
+        f"The {' and '.join(changed)} cameras of {scene.name} have changed since the lift. Query results still use the "
         "old cameras, but renders and evaluations use the new ones. Restore the dataset, give its path with --data, or "
         "lift again."
     ]

@@ -54,8 +54,8 @@ def open_splat(
         say: Function that is called with a message for each assumption, for example `print`.
     Raises:
         FileNotFoundError: A file or image is missing.
-        ValueError: A file cannot be read, does not match the others, or is not a splat.
-        TypeError: An argument has the wrong type.
+        ValueError: A file cannot be read, does not match the others, or is not a splat. Also if `path` is not a path.
+        TypeError: Another argument has the wrong type.
 
     >>> from normlift_ns import SplatOptions, open_run, open_splat
     >>> run = open_run(config)
@@ -65,10 +65,6 @@ def open_splat(
     >>> len(scene.gaussians) == len(rows), len(scene.train)
     (True, 12)
     """
-    if not isinstance(path, str | Path) or not isinstance(options, SplatOptions):
-        raise TypeError(
-            f"open_splat takes a path and SplatOptions, got {type(path).__name__} and {type(options).__name__}"
-        )
     path = Path(path).absolute()
     cameras = read_camera_file(options)
     file = _with_primitive(_read(path), path, options)
@@ -165,7 +161,7 @@ def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None
 _HEAD_BYTES = 64
 _MAGIC = {b"ply": "ply", SPZ_MAGIC: "spz", GZIP_MAGIC: "spz", GLB_MAGIC: "glb"}
 _SNIFFED = {*_MAGIC.values(), "pt", "splat", "gltf"}
-"""Formats that need no suffix, because their first bytes identify them, and splat, which only its suffix identifies."""
+"""Built-in formats. The first bytes of a file decide between them, and its suffix only if the bytes match none."""
 _UNREAD = ("sog", "ksplat", "lcc", "usdz", "usd", "usda", "usdc")
 """Suffixes of unsupported formats."""
 _JSON_FORMATS = {"meta.json": "SOG", "lod-meta.json": "streamed SOG"}
@@ -263,7 +259,7 @@ def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> Splat
     """Return the file with a known primitive, from the options, the files or the file name, in this order.
 
     Raises:
-        ValueError: If options and files contradict each other.
+        ValueError: The options and the files contradict each other.
     """
     named: Primitive = "2dgs" if "2dgs" in path.name.lower() else "3dgs"
     if options.primitive is not None and file.primitive not in (None, options.primitive):
@@ -290,7 +286,9 @@ def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> Splat
 
 
 def _format(path: Path) -> str:
-    """Detect the format of a file by its first bytes, or else by its suffix; return the key of `SPLAT_READERS`.
+    """Detect the format of a file, and return the key of `SPLAT_READERS`.
+
+    The suffix decides for formats of other packages. For all other files, the first bytes decide, or else the suffix.
 
     Raises:
         ValueError: The path is a folder, or the file is not a splat or has an unsupported format.
@@ -301,7 +299,7 @@ def _format(path: Path) -> str:
     suffix = suffix.lower()
     head = b""
     if path.is_dir():
-        raise InputError(f"{path} is a folder, expected the file of a splat. Give a file in it.")
+        raise InputError(f"{path} is a folder, expected the file of a splat. Give the path of the file.")
     if path.is_file():
         with open_regular(path) as file:
             head = file.read(_HEAD_BYTES)

@@ -21,7 +21,7 @@ _MAX_DIVISOR_AS_TRAINED = 4.0
 """Limit on the divisor of the image size for renders in the trained mode.
 
 Below the limit, a render uses the trained mode, and the rasterizer's blur of 0.3 square pixels is scaled down. Other
-renders are antialiased, which preserves the mean of Gaussians smaller than a pixel.
+renders are antialiased, so that the blur does not add opacity to Gaussians smaller than a pixel.
 """
 _SMALL_EPS2D = 0.1
 """Variance in square pixels that the antialiased renders add to projected Gaussians."""
@@ -42,7 +42,10 @@ class ReducedView(NamedTuple):
         return ReducedView(self.view.downscaled(height, width), self.divisor * divisor)
 
     def psnr(self, image: UInt8[Tensor, "h w 3"]) -> float:
-        """Return the PSNR in dB of a render, over the pixels that the mask of the view keeps."""
+        """Return the PSNR in dB of a render, over the pixels that the mask of the view keeps.
+
+        The PSNR is at most 90 dB, and 0 if the mask keeps no pixel.
+        """
         difference = (self.view.image.float() - image.float()) / 255
         if self.view.mask is not None:
             difference = difference[self.view.mask]
@@ -78,7 +81,7 @@ def sample_views(scene: Scene) -> list[ReducedView]:
     Views whose mask leaves no pixels are left out.
 
     Raises:
-        FileNotFoundError, ValueError: If an image is missing or cannot be read, or the masks leave no pixels.
+        FileNotFoundError, ValueError: An image is missing or cannot be read, or the masks leave no pixels.
     """
     last = len(scene.train) - 1
     views = [ReducedView(scene.train[index], 1.0).reduced(_MAX_SIDE) for index in sorted({0, last // 2, last})]

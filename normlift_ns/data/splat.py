@@ -289,7 +289,7 @@ def _remarks(path: Path, vertex: PlyElement, rest: list[str], modes: list[str]) 
 def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Path) -> SplatParameters:
     """Convolve Gaussians with isotropic Gaussians of standard deviations `widths`, as Mip-Splatting does.
 
-    The opacity decreases in proportion to the growth of the volume.
+    The opacity is divided by the factor by which the volume grows.
     """
     if not bool((widths.isfinite() & (widths >= 0)).all()):
         raise InputError(f"{path}: filter_3D has invalid values, expected finite numbers >= 0. Export the scene again.")
@@ -458,7 +458,7 @@ def _mode_names(comments: list[str]) -> list[str]:
 
 
 def transform_splat(splat: SplatParameters, world: WorldTransform) -> SplatParameters:
-    """Return a splat that is rotated, translated and scaled together with its colors, computed in float64."""
+    """Return the splat in another world, computed in float64. Its spherical harmonics rotate with the Gaussians."""
     rotation, translation = (torch.from_numpy(part) for part in np.split(world.transform, [3], axis=1))
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow import)
 

@@ -62,16 +62,16 @@ def encode_spz(
 ) -> bytes:
     """Encode Gaussians as an SPZ file, in the order of their rows and in their own coordinates.
 
-    Positions are rounded to the smallest power of two from 2^-23 to 1 for which all of them fit into 24 bits.
-    Logarithms of scales are rounded to 1/16 and clamped to -10..5.94. Opacities are rounded to 1/255, colors to 1/38,
-    and rotations to 0.004 radians. Spherical harmonics are rounded to 1/16 (degree 1) or 1/8, and clamped to -1..1.
-    Gaussians that are never drawn get opacity 0.
+    Positions are rounded to multiples of a power of two, the smallest from 2^-23 to 1 for which all fit into 24 bits.
+    Logarithms of scales are rounded to 1/16 and clamped to -10..5.94. Opacities are rounded to 1/255. Constant
+    spherical harmonics are rounded to 1/38 and clamped to -3.33..3.33, others to 1/16 (degree 1) or 1/8 and -1..1.
+    Rotations change by at most 0.005 radians. Gaussians that are never drawn get opacity 0.
 
     Args:
         splat: Gaussians to encode.
         antialiased: True if they were trained with the rasterize mode "antialiased".
         version: Version of the format. More programs read version 3; version 4 is newer.
-        position_step: Positions may be rounded to steps of up to this length, which makes the file smaller.
+        position_step: Round positions to larger steps of up to this length, which makes the file smaller.
     Raises:
         ValueError: A Gaussian that can be drawn is farther than 8,388,607 from the origin along an axis.
     """
@@ -106,6 +106,7 @@ def read_spz(path: Path) -> SplatFile:
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: The file is not an SPZ file, is truncated or damaged, or its Gaussians cannot be rendered.
+        MemoryError: The Gaussians do not fit into memory.
     """
     if not path.is_file():
         raise FileNotFoundError(f"The SPZ file {path} does not exist. Give an existing file with --load-ply.")
@@ -114,7 +115,7 @@ def read_spz(path: Path) -> SplatFile:
 
 
 def decode_spz(data: bytes, path: Path) -> SplatFile:
-    """Decode the bytes of an SPZ file, or raise the ValueErrors of `read_spz`; messages contain `path`."""
+    """Decode the bytes of an SPZ file. Errors are those of `read_spz`, and their messages contain `path`."""
     is_gzip = data.startswith(GZIP_MAGIC)
     header, streams = _read_gzip(data, path) if is_gzip else _read_zstd(data, path)
     n, k = header.gaussians, (header.degree + 1) ** 2 - 1
@@ -143,9 +144,9 @@ def decode_spz(data: bytes, path: Path) -> SplatFile:
 
 def spz_rounding(name: str, fractional_bits: int, version: int = 3) -> str:
     """Return a message about the rounding errors of an SPZ file."""
-    turn = "0.1" if version == 2 else "0.004"
+    turn = "0.3" if version == 2 else "0.005"
     return (
-        f"{name} contains rounded numbers. Maximum errors: {0.5 ** (fractional_bits + 1):.2g} for positions, 0.03 for "
+        f"{name} contains rounded numbers. Maximum errors: {0.5 ** (fractional_bits + 1):.2g} for positions, 0.032 for "
         f"logarithms of scales in -10..5.9, {turn} radians for rotations, and 0.002 for opacities."
     )
 
@@ -185,7 +186,10 @@ def _damaged(path: Path, problem: str) -> InputError:
 
 
 def _read_gzip(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
-    """Return the header and the attributes of version 2 or 3; never decompress more bytes than the header declares."""
+    """Return the header and the attributes of version 2 or 3.
+
+    The function decompresses at most one byte more than the header declares.
+    """
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         header = _read_header(stream.decompress(data, _HEADER.size), path)
@@ -193,10 +197,13 @@ def _read_gzip(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
             raise _damaged(path, "it is compressed like version 3, but its header has version 4")
         _check_size(header, len(data), path)
         content = stream.decompress(stream.unconsumed_tail, sum(header.sizes))
+        rest = stream.decompress(stream.unconsumed_tail, 1)  # zlib checks the CRC at the end, unless extensions follow
     except zlib.error as error:
         raise _damaged(path, str(error)) from error
     if len(content) < sum(header.sizes):
         raise _damaged(path, f"it ends after {len(content):,} of {sum(header.sizes):,} bytes")
+    if len(rest) == 0 and not stream.eof:
+        raise _damaged(path, "it ends before its checksum")
     ends = np.cumsum(header.sizes).tolist()
     return header, [content[end - size : end] for end, size in zip(ends, header.sizes)]
 
@@ -205,7 +212,7 @@ def _read_zstd(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
     """Return the header and the attributes of version 4."""
     header = _read_header(data, path)
     if header.version != 4 or len(data) < _TABLE_OFFSET.size:
-        raise _damaged(path, f"its header is not compressed, but has version {header.version} or is too short")
+        raise _damaged(path, f"its uncompressed header has version {header.version}, expected 4, or is too short")
     _check_size(header, len(data) * 64, path)  # zstd can reach a higher compression ratio than deflate
     (start,), number = _TABLE_OFFSET.unpack_from(data), data[_HEADER.size - 1]
     sizes = [size for size in header.sizes if size > 0]

@@ -137,8 +137,8 @@ def read_transforms_entries(path: Path) -> TransformsEntries:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is not valid JSON, does not match the schema, or has no frames, invalid poses or invalid
-            sizes.
+        ValueError: The file is not valid JSON, does not match the schema, has no frames, or has an invalid name, pose
+            or camera parameter.
     """
     expected = "a transforms.json of nerfstudio, instant-ngp or Blender's synthetic scenes"
     values = read_json_file(path, expected)
@@ -152,8 +152,11 @@ def read_transforms_entries(path: Path) -> TransformsEntries:
     for frame in entries.frames:
         _check_numbers(frame, f"{path}: {frame.file_path}")
         names = (frame.file_path, frame.mask_path or "-")
-        if any(name.strip() == "" or "\0" in name for name in names):
-            raise InputError(f"{path}: the file_path or mask_path {names} is not a valid file name.")
+        if (invalid := next((name for name in names if name.strip() == "" or "\0" in name), None)) is not None:
+            raise InputError(
+                f"{path} has the file_path or mask_path {invalid!r}, which is not a valid file name. Correct the entry "
+                "of this frame."
+            )
         if not _is_matrix(frame.transform_matrix):
             raise InputError(
                 f"{path}: the transform_matrix of {frame.file_path} is not valid. Expected a camera-to-world matrix of "
@@ -205,7 +208,8 @@ class CameraFile(NamedTuple):
     names_root: Path
     """Base folder of the relative image names."""
     applied_transform: Float[np.ndarray, "4 4"] | None = None
-    """Transform from the world of the capture to the world of the file, as applied by ns-process-data."""
+    """Transform from the world of the capture to the world of the file, as applied by ns-process-data; None for COLMAP.
+    """
     applied_scale: float = 1.0
     """Scale of `applied_transform`."""
     remarks: tuple[str, ...] = ()
@@ -232,8 +236,8 @@ def read_transforms(
         advice: Advice on missing images, for error messages.
     Raises:
         FileNotFoundError: The file, an image or a mask is missing.
-        ValueError: The file is not valid JSON, does not match the schema, or has a camera model that cannot be
-            undistorted.
+        ValueError: The file is not valid JSON, does not match the schema, has invalid or contradictory values, or has a
+            camera model that cannot be undistorted. Also if two images share a file.
     """
     path = path / "transforms.json" if path.is_dir() else path
     entries = read_transforms_entries(path)
@@ -317,7 +321,7 @@ def _listed_masks(entries: TransformsEntries, root: Path, images: Path | None, p
 def _find_mask(name: str, root: Path, images: Path | None) -> Path | None:
     """Return the path of an existing mask, or None.
 
-    The function tries the path in the file, and folders of the same name inside and next to the image folder.
+    The function tries the path in the file, and then folders named like the mask's folder, inside and next to `images`.
     """
     own, *ends = possible_paths(root, name)
     tail = Path(*Path(plain_name(str(own))).parts[-2:])
@@ -683,6 +687,8 @@ def _apply(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -
 
 def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
     """Return the transform that maps the mean up axis of the cameras to -y, and their focus point to the origin.
+
+    The median distance of the transformed cameras from the origin is 1.
 
     Args:
         poses: Camera-to-world matrices in OpenCV convention.

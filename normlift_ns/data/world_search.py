@@ -32,7 +32,7 @@ _SAME_DEPTH = 1.05
 _LIKELY, _MAX_LIKELY = 0.7, 4
 """Minimum agreement of worlds to render, relative to the best world, and maximum number of these worlds."""
 _SCALES = 1.12 ** np.arange(-61, 62)
-"""Uniform scales that are tried, 0.001 to 1000."""
+"""Uniform scales that are tried, from about 0.001 to about 1000."""
 _SHRINKING = (0.04, 0.02, 0.01)
 """Successive step sizes, in the logarithm of the scale, when points refine a scale."""
 _PARABOLAS, _MAX_MOVES = ((100, 0.01), (400, 0.001)), 5
@@ -41,8 +41,8 @@ maximum number of these steps."""
 _MIN_START = 2.0
 """Minimum lead in dB of the PSNR of a first render over the PSNR of the mean color of its image."""
 _TURN, _TURNED_SIDE = math.radians(1), 200
-"""Angle of the rotations with which a correct world fits worse, and longer side in pixels of the renders that check
-this."""
+"""Angle in radians of the rotations with which a correct world fits worse, and longer side in pixels of the renders
+that check this."""
 _SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 _ROUND = 1e-3
@@ -103,7 +103,7 @@ class _Motion(NamedTuple):
     """Change from one candidate world to another."""
 
     matrix: Float[np.ndarray, "4 4"]
-    """Similarity between the two worlds."""
+    """Similarity from the first world to the second."""
     flipped: bool
     """True if only one of the worlds has cameras with the axes of OpenCV."""
 

@@ -24,7 +24,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 
 _MIN_POINTS = 4
 _SAME = 1e-3
-"""Largest difference between corresponding numbers of two worlds that count as equal, relative to their size."""
+"""Absolute and relative tolerance of the numbers of two worlds that count as equal."""
 _Y_DOWN_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Rotation that ns-process-data and nerfstudio's COLMAP data parser apply to the cameras of COLMAP."""
 _TURNS = {
@@ -91,7 +91,7 @@ def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile
     OpenCV's axes.
 
     Raises:
-        FileNotFoundError, ValueError: If the world that the options or files state cannot be read or computed.
+        FileNotFoundError, ValueError: The world that the options or files state cannot be read or computed.
     """
     if isinstance(options.world_transform, Path):
         world = read_world_transform(options.world_transform, cameras.applied_transform, cameras.applied_scale)

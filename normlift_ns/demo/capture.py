@@ -132,7 +132,7 @@ def write_splatfacto_run(room: DemoRoom, capture_folder: Path, output_dir: Path)
     Returns:
         The path of the run's config.yml.
     Raises:
-        AssertionError: If `capture_folder` does not exist; nerfstudio raises this error.
+        AssertionError: `capture_folder` does not exist; nerfstudio raises this error.
     """
     from nerfstudio.models.splatfacto import RGB2SH  # noqa: PLC0415
 

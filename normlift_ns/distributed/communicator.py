@@ -124,7 +124,7 @@ class TorchCommunicator(Communicator):
         Args:
             folder: Directory that all processes share.
         Raises:
-            InputError: If the processes do not share the directory, or two processes can create the same file in it.
+            InputError: The processes do not share the directory, or two processes can create the same file in it.
         """
         if self.rank == 0:
             for leftover in folder.glob("team-*"):  # from processes that were killed

@@ -41,7 +41,7 @@ def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | Non
     """Return rank and world size from the variables of torchrun or `launch_processes`, or None for a single process.
 
     Raises:
-        InputError: If the values are not valid numbers.
+        InputError: A value is not a whole number, or the rank is not below the world size.
 
     >>> address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
     >>> rank_and_world_size({"RANK": "1", "WORLD_SIZE": "2", **address}), rank_and_world_size({})
@@ -151,7 +151,7 @@ def _use_single_gpu(local_rank: int, device: str) -> None:
     """Hide all GPUs except the one with the local rank of the process, before torch initializes CUDA.
 
     Raises:
-        InputError: If the machine has no GPU for the local rank.
+        InputError: The machine has no GPU for the local rank.
     """
     import torch  # noqa: PLC0415 (not needed by the launcher)
 
@@ -176,8 +176,9 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
         log: Callback for messages about a long wait for other processes, and about a lost process that no other process
             reports.
     Raises:
-        InputError: If the processes cannot connect, or the machine has too few GPUs.
-        SystemExit: If another process fails or is lost; the exit code is 1.
+        InputError: The processes cannot connect, or the machine has too few GPUs. Also the errors of
+            `rank_and_world_size`.
+        SystemExit: Another process failed or is lost. The exit code is 1.
     """
     ranks = rank_and_world_size(os.environ)
     if ranks is None:

@@ -153,7 +153,7 @@ def consensus_distributed(views: ViewObservations, portion: Partition, *, sample
 
 
 def gather_sample(views: ViewObservations, portion: Partition, sample: int) -> tuple[Evidence, Float64[Tensor, " m"]]:
-    """Return the evidence and the sampling probabilities of the Gaussians that all processes sample, in index order.
+    """Return the evidence and the sampling probabilities of the Gaussians that the processes sample, in index order.
 
     Args:
         sample: Minimum number of Gaussians in every region; see `consensus`.
@@ -180,7 +180,7 @@ def vote_distributed(
 
     Returns:
         The Gaussian whose direction each Gaussian of the partition takes, the options with the resolved parameters of
-        the vote, and the manifest entries (the gate and shares of all Gaussians).
+        the vote, and the manifest entries: a measured gate, and the shares of `vote_shares`.
     """
     team, gaussians = portion.communicator, portion.indices
     with stages("neighbors", len(gaussians)):

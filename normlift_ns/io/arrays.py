@@ -30,7 +30,7 @@ FLOAT32_MAX = float(np.finfo(np.float32).max)
 _BLOCK = 2**20
 """Number of float16 numbers that are compared at a time."""
 _SMALL_FILE = 2**20
-"""Size in bytes up to which a file is read without a look at the free memory, which takes longer than the reading."""
+"""Size in bytes up to which a file is read without a check of the free memory, which would take longer than reading."""
 DIGEST_KEY = "digest"
 """Metadata key of the digest."""
 _Array = Any
@@ -250,8 +250,8 @@ def read_npy(path: Path, description: str) -> np.ndarray:
         description: Kind of file, for error messages.
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is not an NPY file, contains anything except numbers, or does not have the size that its
-            header declares.
+        ValueError: The file is not an NPY file, contains anything except booleans and real numbers of at most 64 bits,
+            or does not have the size that its header declares.
     """
     if not os.path.isfile(path):
         if os.path.lexists(path):

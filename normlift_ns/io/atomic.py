@@ -52,7 +52,7 @@ def file_digest(*files: Path, compare_to: str = "") -> str:
         compare_to: Digest that the caller compares with the result. For a digest of version 0.1, the function uses the
             hash of that version, which is much slower.
     Raises:
-        OSError: A file cannot be read.
+        OSError, ValueError: A file does not exist, cannot be read, or is not a regular file.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "a.txt"
@@ -92,7 +92,7 @@ def acquire_lock(folder: Path) -> int | None:
         The file descriptor for `release_lock`, or None if the system does not support locks.
     Raises:
         BlockingIOError: Another process holds the lock.
-        OSError: The folder does not exist.
+        OSError: The folder does not exist or cannot be opened.
     """
     if sys.platform == "win32":
         return None
@@ -296,11 +296,12 @@ def atomic_files(
     Args:
         paths: Final paths, all in one folder.
         overwrite: Replace existing files of the same kind.
-        delete: Files to delete in the same step, if they exist and their content matches their suffix.
+        delete: Files to delete in the same step, if they exist.
         own: Skip the checks of inputs and kinds, for files of runs and caches that this package wrote itself.
     Raises:
         FileExistsError: A path exists, and `overwrite` is False.
-        ValueError: The errors of `refuse_inputs`, or an existing file is of a different kind. No file has changed.
+        ValueError: The errors of `refuse_inputs`. With `overwrite`, also if an existing file is of a different kind. No
+            file has changed.
         NotWrittenError: Writing failed, for instance because the disk is full. No file has changed.
 
     >>> import tempfile

@@ -1,4 +1,4 @@
-"""Read the files of a semantic field, and check their digests, shapes, index ranges and finite values.
+"""Reader for the files of a semantic field, which checks their digests, shapes, index ranges and finite values.
 
 This module does not need torch.
 """

@@ -168,7 +168,7 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=Tru
         kind: Kind of the output, as `file_kind` returns it; None if it is not known yet.
         flags: Flags for choosing the output, quoted in the error message.
     Raises:
-        ValueError: `path` is a folder, a pipe, a device or a broken link, or its content is of a different kind.
+        ValueError: `path` is a folder, a pipe, a device or a broken link, cannot be read, or is of a different kind.
     """
     if not os.path.lexists(path):
         return

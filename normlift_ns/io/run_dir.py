@@ -116,7 +116,7 @@ def recorded_gsplat_version(run_dir: Path) -> str | None:
 
 
 def resolve_manifest_paths(manifest: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
-    """Return a manifest in which the path of the text embeddings starts with `folder`, the folder of the manifest."""
+    """Return a manifest in which a relative path of text embeddings is joined to `folder`, the manifest's folder."""
     encoder = manifest.get("encoder")
     if not isinstance(encoder, dict) or encoder.get("text_vectors") is None:
         return manifest
@@ -172,7 +172,7 @@ def refuse_existing_run(run_dir: Path, overwrite: bool, source: Path | None = No
         source: File that the lift reads.
     Raises:
         FileExistsError: The directory exists, and `overwrite` is False or the directory is not a lifted run.
-        ValueError: `source` is in the directory, or the directory is part of another run.
+        ValueError: `source` is in the directory, or the errors of `refuse_inputs`.
     """
     flags = "--timestamp or --output-dir"
     refuse_inputs([run_dir], instead=flags)
@@ -211,7 +211,7 @@ def written_files(run_dir: Path) -> set[str]:
 
 
 class _Metadata(msgspec.Struct):
-    """Entries of a manifest that programs read; all other entries are for people."""
+    """Entries of a manifest whose types are checked."""
 
     num_gaussians: _Count
     dimension: _Count
@@ -313,7 +313,7 @@ def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapp
 
 
 def _ends_as_archive(path: Path) -> bool:
-    """Return whether a file has the record that ends a ZIP archive. This reads the last 66 kB only."""
+    """Return True if a file ends with the last record of a ZIP archive. Only the last 66 kB are read."""
     with open_regular(path) as file:
         return zipfile.is_zipfile(file)
 

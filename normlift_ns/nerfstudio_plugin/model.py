@@ -114,7 +114,7 @@ class NormLiftModel(SplatfactoModel):
         """Load a splatfacto or normlift checkpoint, and then the semantic field of the config.
 
         Raises:
-            FileNotFoundError, ValueError: If the field is missing, is damaged, or belongs to other Gaussians.
+            FileNotFoundError, ValueError: The field is missing, is damaged, or belongs to other Gaussians.
         """
         super().load_state_dict({k: v for k, v in dict.items() if not k.startswith("lpips.")}, **kwargs)
         if self.config.semantics is not None:
@@ -242,7 +242,8 @@ def find_field_folder(semantics: Path) -> Path:
     config to models. This function therefore finds that path in the call stack.
 
     Args:
-        semantics: Folder in the config, which is returned if config.yml has no folder next to it.
+        semantics: Folder in the config, which is returned if `eval_setup` is not running, or if there is no such folder
+            next to config.yml.
     """
     frame = inspect.currentframe()
     while frame is not None:

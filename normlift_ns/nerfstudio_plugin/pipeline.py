@@ -66,7 +66,8 @@ class NormLiftPipeline(VanillaPipeline):
         """Return splatfacto's callbacks and the lift, after checking the requirements of the lift.
 
         Raises:
-            ValueError, FileNotFoundError: If the encoder or a query cannot be used.
+            ValueError, FileNotFoundError, PermissionError: The encoder or a query cannot be used. Also the errors of
+                `check_before_training`.
         """
         callbacks = super().get_training_callbacks(training_callback_attributes)
         trainer, model = training_callback_attributes.trainer, cast(NormLiftModel, self.model)
@@ -88,9 +89,9 @@ def check_before_training(trainer: Trainer) -> None:
     """Raise before training if the lift at its end would fail, and print warnings about the images.
 
     Raises:
-        ValueError, FileNotFoundError: If the lift does not support the scene, an option is out of range, or nerfstudio
+        ValueError, FileNotFoundError: The lift does not support the scene, an option is out of range, or nerfstudio
             misreads the pixel values of an image.
-        PermissionError: If the folder of the run or of the lift's caches is not writable.
+        PermissionError: The folder of the run or of the lift's caches is not writable.
     """
     config: Any = trainer.config
     path = trainer.base_dir / "config.yml"
@@ -120,7 +121,8 @@ def feature_source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSour
     """Make the feature source of a config. LangSplat's features are read from the dataset unless a folder is given.
 
     Raises:
-        ValueError, FileNotFoundError: If `make_source` fails. The message names the options of ns-train.
+        ValueError, FileNotFoundError: `make_source` fails. For missing features of LangSplat, the message names the
+            options of ns-train.
     """
     options = _source_options(config)
     try:

@@ -51,6 +51,14 @@ def test_places_are_those_of_the_capture(written: Path, lifted: Path, room: Demo
     assert ratio == pytest.approx(np.full(3, transform["scale"] / 0.5))
 
 
+def test_the_renders_use_the_given_device(lifted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[str] = []
+    monkeypatch.setattr("normlift_ns.core.device.choose_device", lambda name="auto": chosen.append(name) or "cpu")
+    flags = ("--load-config", lifted, "--text", "red", "--objects", "--device", "cpu")
+    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    assert chosen == ["cpu"]
+
+
 def test_of_many_objects_the_table_has_the_largest(lifted: Path, capsys) -> None:
     run = open_run(lifted)
     red = run.ask("red")

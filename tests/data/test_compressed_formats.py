@@ -255,6 +255,8 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
         ("a.spz", gzip.compress(changed(content, 12, b"\7")), "degree 7"),
         ("a.spz", gzip.compress(changed(content, 8, b"\xff\xff\xff\x7f")), "declares 2,147,483,647 Gaussians"),
         ("a.spz", spz[:-30], "truncated or damaged"),
+        ("a.spz", spz[:-8], "ends before its checksum"),
+        ("a.spz", changed(spz, len(spz) - 8, bytes(4)), "truncated or damaged"),
         ("a.spz", changed(spz4, 15, b"\3"), "table of 3 streams"),
         ("a.spz", changed(spz4, 40, b"\xff\xff"), "stream 0 declares"),
         ("a.spz", spz4[:-9], r"damaged: its stream 5 ends after"),

@@ -46,10 +46,11 @@ def check_config_exists(path: Path, wrote: str = "ns-train") -> None:
         wrote: Command that writes such files, for the error message.
     """
     if not path.is_file():
-        hint = f", but {path / 'config.yml'} does; give that path" if (path / "config.yml").is_file() else ""
+        problem = "is a folder, not a file" if path.is_dir() else "does not exist"
+        hint = f"; give {path / 'config.yml'}" if (path / "config.yml").is_file() else ""
         method = "splatfacto" if wrote == "ns-train" else "normlift"
         raise FileNotFoundError(
-            f"The config {path} does not exist{hint}. Expected the config.yml that {wrote} wrote, for example "
+            f"The config {path} {problem}{hint}. Expected the config.yml that {wrote} wrote, for example "
             f"--load-config outputs/fox/{method}/2024-05-01_120000/config.yml."
         )
 
@@ -623,6 +624,7 @@ def read_trainer_config(path: Path, say: Callable[[str], None] = lambda text: No
         say: Function that is called with a sentence about ignored settings.
     Raises:
         FileNotFoundError: The file does not exist.
+        OSError: The file cannot be read.
         ValueError: The file is not a nerfstudio config, or it has an unsupported method, data parser or class, or
             invalid values.
     """

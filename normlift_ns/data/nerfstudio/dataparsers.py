@@ -276,8 +276,8 @@ def split_files(
 ) -> tuple[Any, Any]:
     """Return the indices of the training images and of the evaluation images.
 
-    The lists of the dataset take precedence over eval_mode. Evaluation images are in the test list, or else in the
-    validation list, which ns-train evaluates on.
+    The lists of the dataset take precedence over eval_mode. The evaluation images are those of the test list, or of the
+    validation list if there is no test list. Without these two lists, there are none.
 
     Raises:
         ValueError: There are lists, but no list of training images, or a listed file is missing. Also if eval_mode is

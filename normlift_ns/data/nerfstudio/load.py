@@ -295,8 +295,8 @@ def _check_transform(
     if not is_close:  # or NaN
         raise InputError(
             f"The dataset {location.data} has changed since the training of {location.run_dir}: frames were added, "
-            f"removed or moved. Its poses give scale {scale:.6g}, but {file.name} has {trained.scale:.6g}, and world "
-            f"coordinates differ by up to {gap:.3g}. Restore the camera file of the dataset{advice}."
+            f"removed or moved. Its poses give scale {scale:.6g}, but {file.name} has {trained.scale:.6g}, and the "
+            f"numbers of the transforms differ by up to {gap:.3g}. Restore the camera file of the dataset{advice}."
         )
     return ()
 
