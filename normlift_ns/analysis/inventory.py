@@ -80,7 +80,7 @@ class Inventory:
             ValueError: The inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
-            raise InputError(f"Object {number} does not exist. The objects are numbered from 1 to {len(self)}.")
+            raise InputError(f"Object {number} does not exist. The inventory has {len(self)} objects, numbered from 1.")
         return self.instance_id == number
 
 
@@ -358,8 +358,8 @@ def best_words(
 
     Some words are similar to everything. The cosines of each word are therefore standardized over the scene, and then
     those of each object over the words that are not names. The score of the best name must exceed a limit. If the
-    scores were normally distributed, `by_chance` pairs of an object and a name would exceed this limit. If all words
-    are names, the scores are standardized over all words, and the best name must also have the best score.
+    scores of 20 objects were normally distributed, `by_chance` pairs of an object and a name would exceed this limit.
+    If all words are names, the scores are standardized over all words, and the best name must also have the best score.
 
     Args:
         directions: Unit directions of the objects, from `mean_directions`.

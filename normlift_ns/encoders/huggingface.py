@@ -353,8 +353,8 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
     """Check the options as far as possible without torch.
 
     Raises:
-        InputError: If packages are missing or too old, an option applies only to another encoder, or the folder has
-            a different architecture.
+        InputError: If packages are missing or too old, an option applies only to another encoder, the name is not a hub
+            name, or the folder is incomplete, damaged or of a different architecture.
         FileNotFoundError: If the folder does not exist, or the network is not on this machine and the hub cannot be
             reached.
     """
@@ -399,7 +399,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 
     Raises:
         FileNotFoundError: If the network is not on this machine and cannot be downloaded.
-        InputError: If the network to download has a different architecture.
+        InputError: If config.json of the network to download is damaged or has a different architecture.
     """
     local = find_local_model(model)
     if local is not None:

@@ -95,7 +95,7 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
     """Return the network that the config.json of a folder describes.
 
     Raises:
-        ValueError: If config.json is missing or describes none of `kinds`.
+        ValueError: If config.json is missing, is damaged, or describes none of `kinds`.
     """
     model_type = read_json(folder / CONFIG_FILE).get("model_type")
     kind = kinds.get(model_type) if isinstance(model_type, str) else None
@@ -109,7 +109,7 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
 
 
 def check_versions(kind: SamFamily) -> None:
-    """Raise InputError if the installed torch or transformers is too old for a network."""
+    """Raise InputError if the installed torch or transformers is too old for a network other than the original SAM."""
     if kind is not SAM:
         weights.check_packages(kind.name, {"torch": _MIN_TORCH, "transformers": kind.min_transformers}, _ALTERNATIVE)
 
@@ -277,8 +277,8 @@ def load_sam_checkpoint(checkpoint: str) -> tuple[SamFamily, Any]:
 
     Raises:
         FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
-        ValueError: If the checkpoint is damaged, its network does not accept points, or the installed torch or
-            transformers is too old.
+        ValueError: If the checkpoint is damaged, its network does not accept points, or torch or transformers is
+            missing or too old.
     """
     path = locate_sam(checkpoint, POINT_PROMPT_FAMILIES)
     folder = transformers_folder(path)
@@ -390,8 +390,8 @@ def transformers_name(name: str) -> str:
 def config_from_weights(state: Mapping[str, Tensor]) -> Any:
     """Return the SamConfig of transformers for a file published by Meta, derived from the shapes of its parameters.
 
-    The shapes do not determine the epsilon and the number of heads (eight) of the mask decoder. These values are the
-    same in all of Meta's files.
+    The shapes do not determine the number of heads (eight) of the mask decoder and the epsilon of its layer norms
+    (1e-5). These values are the same in all of Meta's files.
     """
     shape = {name: tuple(value.shape) for name, value in state.items()}
     _, grid, _, width = shape["image_encoder.pos_embed"]

@@ -210,13 +210,17 @@ class RemoteRun:
 
     @check_arguments
     def coverage(self, min_reliability: float | None = None) -> dict[str, Any]:
-        """Find regions without reliable evidence, and return the content of `Coverage.to_json`."""
+        """Find regions without reliable evidence, and images and poses that would add evidence.
+
+        Returns:
+            The content of `Coverage.to_json`.
+        """
         query = "" if min_reliability is None else f"?min_reliability={min_reliability}"
         return json.loads(self._get(self._path("coverage" + query)))
 
     @check_arguments
     def features(self, start: int = 0, stop: int | None = None) -> Float[Tensor, "m d"]:
-        """Return the unit features of the Gaussians `start` to `stop` - 1 (default: all).
+        """Return the unit features of the Gaussians `start` to `stop` - 1 (default: all), or 0 without a direction.
 
         Raises:
             ValueError: The range is not valid, or has more than 131,072 Gaussians.

@@ -412,7 +412,7 @@ class RunStore:
         """Return the run with the id `name`, and open it if necessary.
 
         Raises:
-            ValueError: No run has this id, or the run cannot be opened.
+            ValueError, FileNotFoundError: No run has this id, or the run cannot be opened.
         """
         if name not in self._configs:
             raise InputError(f"The server has no run {name!r}. Choose one of: {', '.join(self.ids)}.")
