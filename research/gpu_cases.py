@@ -15,6 +15,7 @@ from research import rooms
 from tests.captures import trained_scene, training_cameras
 
 CELL, DIMENSION = 60, 512
+"""Side of the square regions in pixels, and number of feature channels."""
 
 
 def grid_labels(camera: Camera) -> torch.Tensor:
