@@ -1,10 +1,10 @@
-"""2D features of regions, by what an encoder's features are like: six statistics, pure functions with a generator.
+"""Features of regions with six kinds of statistics, like those of different encoders; pure functions with a generator.
 
-Made of words, the feature of a mask is normalise(t + C c + O o + N n): t the text vector of its class, c one direction
-that all image features share (the modality gap), o a direction of the object's own, n noise of this mask in this view.
-c and o are orthogonal to the classes. A region that is no thing shows a mixture of classes: t and o are then means over
-its pixels. The noise follows the covariance of text vectors, so that it is confusion rather than static, or is the same
-in all directions.
+Made of words, the feature of a mask is normalize(t + C c + O o + N n). Here, t is the text vector of its class, c is a
+direction that all image features share (the modality gap), and o is a direction of the object. n is the noise of this
+mask in this view. c and o are orthogonal to the classes. A region that does not follow an object shows a mixture of
+classes, so t and o are means over its pixels. The noise follows the covariance of text vectors, so that it resembles
+confusion with other classes, or is the same in all directions.
 
 | statistic | one object in two views | two objects | |
 |---|---|---|---|
@@ -12,12 +12,11 @@ in all directions.
 | isotropic | 0.13 | 0.10 | text vectors with the same noise in all directions, no modality gap |
 | low contrast | 0.90 | 0.85 | a long common direction |
 | orthogonal | 0.26 | 0 | texts in random directions, no modality gap |
-| histogram | as it is | as it is | colour and gradient of rendered pictures, see `looks` |
-| real | 0.39 to 0.77 | 0.22 | as measured on photographs, in `research.real_features`; decides nothing |
+| histogram | that of the images | that of the images | color and gradient of rendered images, see `Looks` |
+| real | 0.39 to 0.77 | 0.22 | as measured on photographs, in `research.real_features`; not used for decisions |
 
-The cosines are those of step "noise only" with 512 dimensions. The lengths of the noise of isotropic and orthogonal
-features are chosen so that, at step "noise", a single feature is about as often nearest to another class's text as a
-CLIP-like one.
+The cosines are those of step "noise only" with 512 dimensions. The noise of isotropic and orthogonal features is as
+long as makes a single feature at step "noise" about as often nearest to the text of another class as a CLIP-like one.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ import normlift_ns
 
 TABLE = Path(normlift_ns.__file__).parent / "encoders" / "imagenet_words.json"
 MANY_USES = 10
-"""Number of uses from which a sense that never occurs is not meant."""
+"""Number of uses from which a sense without any use is omitted."""
 SOURCE = "Made from WordNet 3.0 by research/imagenet_words.py; the license of WordNet:"
 
 

@@ -44,7 +44,7 @@ from research.made_things import MADE, Mesh, box, plaster, wood
 
 WIDTH, HEIGHT, FOCAL = 800, 600, 780.0
 NEAR = 0.05
-"""Distance in meters of the nearest thing that is drawn."""
+"""Distance of the near plane in meters."""
 PARTS = 4
 """Rows and columns of the parts of a pixel, of which its color is the mean."""
 SCANS = {
@@ -75,7 +75,7 @@ PLACES = {
     "Granny Smith": (-0.5, 0.0, 0, 1),
     "orange": (-0.43, -0.22, 40, 1),
 }
-"""Position of each thing on the table, in meters; its turn, in degrees; and its size relative to its file."""
+"""Position of each object on the table in meters, its rotation in degrees, and its size relative to its file."""
 TABLE = (1.36, 0.96, 0.04)
 FLOOR, WALL = -0.74, 2.4
 """Height of the floor below the top of the table, and distance of the walls from its middle."""

@@ -50,7 +50,7 @@ CONFIG = CAPTURES / "outputs" / "tabletop" / "splatfacto" / "run" / "config.yml"
 
 
 def by_scikit_image(image: Tensor, count: int) -> np.ndarray:
-    """Return the labels that this package took before, without gaps."""
+    """Return scikit-image's labels, which earlier versions of this package used, without gaps."""
     labels = slic(image.numpy(), n_segments=count, compactness=10.0, start_label=0)
     return np.unique(labels, return_inverse=True)[1].reshape(labels.shape)
 
@@ -74,7 +74,7 @@ def boundary_recall(labels: np.ndarray, truth: np.ndarray) -> float:
 
 
 def undersegmentation_error(labels: np.ndarray, truth: np.ndarray) -> float:
-    """Return the pixels that superpixels share with things that they leave, over all pixels.
+    """Return the undersegmentation error of Neubert and Protzel; see the module docstring.
 
     >>> undersegmentation_error(np.array([[0, 0, 0, 0, 1, 1]]), np.array([[0, 0, 0, 1, 1, 1]]))  # 1 of 4, twice, of 6
     0.3333333333333333

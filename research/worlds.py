@@ -107,7 +107,7 @@ class Case:
         return scene, watch
 
     def worlds(self) -> Iterator[tuple[str, str, np.ndarray | None, dict[str, Any]]]:
-        """Yield key and part of the name of every world, the change of the splat, and options of its cameras."""
+        """Yield the key and part of the name of every world, the change of the splat, and options for its cameras."""
         for key, linear in TURNS.items():
             yield key, "", _square(linear), {}
         write_transforms(self.folder / "opencv.json", with_opengl_axes(self.frames), [])
@@ -144,7 +144,7 @@ def _pale_image(frame: Frame, folder: Path) -> Path:
 
 
 def _first(case: Case, matrix: np.ndarray | None, options: dict[str, Any]) -> Alignment:
-    """Return the alignment without a search."""
+    """Return the alignment in the first world, without a search."""
     scene, _ = case.open(matrix, **{**options, "world_transform": None})
     return measure_alignment(scene, explain=False)
 
@@ -186,7 +186,7 @@ def measure_world(case: Case, number: int) -> Rows:
 
 
 def measure_rotations(case: Case, numbers: range) -> Rows:
-    """Return for random rotations whether they are taken, and their margins."""
+    """Return, for random rotations, whether a world is accepted, and its margin."""
     generator = np.random.default_rng(CAPTURES.index(case.name))
     turns, rows = generator.normal(size=(ROTATIONS, 4)), []
     for number in numbers:
@@ -219,7 +219,7 @@ def _limit_threads(count: int) -> None:
 
 @cache
 def _case(name: str) -> Case:
-    """Return the case of a capture, one in every process, with compiled kernels."""
+    """Return the case of a capture, cached in each process, with compiled kernels."""
     folder = tempfile.TemporaryDirectory()
     atexit.register(folder.cleanup)
     case = Case(name, Path(folder.name))
