@@ -219,7 +219,9 @@ if __name__ == "__main__":
     parser.add_argument("--views", type=int, help="training views of the tabletop; all by default")
     parser.add_argument("--seeds", type=int, default=SEEDS, help="repeats")
     parser.add_argument("--scenes", nargs="+", default=["tabletop", "demo"], help="tabletop, demo")
-    parser.add_argument("--minutes", type=float, help="no observation begins later than this")
-    parser.add_argument("--rows", type=Path, default=RESULTS / "accuracy_rows.jsonl", help="finished observations")
+    parser.add_argument("--minutes", type=float, help="minutes after which no observation starts")
+    parser.add_argument(
+        "--rows", type=Path, default=RESULTS / "accuracy_rows.jsonl", help="file of finished observations"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     main(parser.parse_args())

@@ -72,7 +72,7 @@ def main() -> None:
     from tests.captures import SHARED  # noqa: PLC0415
 
     parser = argparse.ArgumentParser()
-    parser.add_argument("--views", type=int, help="of an even spread; by default all 44")
+    parser.add_argument("--views", type=int, help="number of evenly spread views; all 44 by default")
     world, words = tabletop(parser.parse_args().views), real_words()
     names = read_names(SHARED / "captures" / "tabletop" / "labels.json").classes
     rows = {step: box_scores(world.scene.means, world.truth, asked(world, words, d)) for step, d in DAMAGES.items()}

@@ -71,7 +71,7 @@ start.lift()
 
 
 def caches(folder: Path) -> dict[str, str]:
-    """Environment with the caches of kernels and bytecode in folder/kernels."""
+    """Return environment variables that place the caches of kernels and bytecode in folder/kernels."""
     return {
         "TRITON_CACHE_DIR": f"{folder}/kernels/triton",
         "NUMBA_CACHE_DIR": f"{folder}/kernels/numba",
@@ -289,7 +289,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", type=Path, default=FOX, help="config.yml of a trained run; by default the fox")
     parser.add_argument("--quick", action="store_true", help="fewer runs")
-    parser.add_argument("--before", type=Path, help="another checkout, to compare what is waited for with colors")
+    parser.add_argument("--before", type=Path, help="another checkout, whose times with colors are compared")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     main(arguments.config, arguments.quick, arguments.before, arguments.output)

@@ -157,9 +157,9 @@ def main(arguments: argparse.Namespace) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=["tabletop", "demo"], help="tabletop, demo")
-    parser.add_argument("--steps", nargs="+", default=STEPS, choices=LADDER, help="of the ladder of damage")
+    parser.add_argument("--steps", nargs="+", default=STEPS, choices=LADDER, help="steps of the ladder of damage")
     parser.add_argument("--sample", type=int, help="Gaussians that count; all by default")
     parser.add_argument("--seeds", type=int, default=SEEDS, help="repeats")
-    parser.add_argument("--first-seed", type=int, default=0, help="100 and more are for development")
+    parser.add_argument("--first-seed", type=int, default=0, help="first seed; 100 and more are for development")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     main(parser.parse_args())

@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("config")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--texts", nargs="+", required=True)
-    parser.add_argument("--objects", type=int, default=1, help="of each text")
+    parser.add_argument("--objects", type=int, default=1, help="objects to draw for each text")
     given = parser.parse_args()
     run = nl.open_run(given.config)
     given.folder.mkdir(parents=True, exist_ok=True)

@@ -392,13 +392,7 @@ def nearest(root: Path, fault: Fault, most: int = 8) -> list[str]:
 
 
 def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Path, *, together: bool) -> None:
-    """Looks for every fault with the nearest files, then for the rest with the whole tier; saves what is found.
-
-    Args:
-        trees: equal checkouts, each with a `.venv`; so many faults are tried at a time.
-        label: the name of what is run, a column of the table.
-        together: begin with all faults planted together.
-    """
+    """Search a test for every fault, first in the nearest files and then in the whole tier, and save the results."""
     found = {x.name: dict(x.found or {}) for x in faults}
     free: Queue[Path] = Queue()
     for tree in trees:
@@ -410,7 +404,7 @@ def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Pat
         save.write_text(json.dumps([asdict(replace(x, found=found[x.name])) for x in faults], indent=1) + "\n")
 
     def first(fault: Fault, words: list[str], limit: float) -> str:
-        """The first test that fails with a fault and passes without it."""
+        """Return the first test that fails with a fault and passes without it, or ""."""
         tree = free.get()
         try:
             with planted(tree, [fault]):
@@ -485,7 +479,7 @@ def table(faults: list[Fault]) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(
-        description="Plants small faults in the package, to see whether the tests find them."
+        description="Plant small faults in the package, and measure how many the tests find."
     )
     actions = parser.add_subparsers(dest="action", required=True)
     drawing = actions.add_parser("draw")

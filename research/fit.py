@@ -227,6 +227,6 @@ if __name__ == "__main__":
     parser.add_argument("--scenes", nargs="+", default=["tabletop", "demo"], help="tabletop, demo")
     parser.add_argument("--voters", type=int, default=20_000, help="Gaussians that vote and count")
     parser.add_argument("--views", type=int, help="training views of the tabletop; all by default")
-    parser.add_argument("--seeds", type=int, default=5, help="repeats for the fit, and as many for the report")
+    parser.add_argument("--seeds", type=int, default=5, help="repeats for the fit, and for the report")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     main(parser.parse_args())

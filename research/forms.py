@@ -89,7 +89,7 @@ def clip_cases(some: Sequence[str]) -> Iterator[Case]:
 
 
 def colour_cases(some: Sequence[str]) -> Iterator[Case]:
-    """Mean colours of masks, or of superpixels where there are none."""
+    """Yield cases with the mean colors of masks, or of superpixels if there are none."""
     encoder, room = ColorEncoder(), plain_room()
     names = [name.removesuffix("_colour") for name in some if name.endswith("_colour")]
     queries = encoder.text(sorted(name.removeprefix("xkcd:") for name in XKCD_COLORS)[::5]).double()
@@ -109,7 +109,8 @@ def colour_cases(some: Sequence[str]) -> Iterator[Case]:
 
 
 def photographs(name: str, cameras: Sequence[Camera]) -> list[Tensor]:
-    """Of the training views, at the size of their cameras. Lens distortion stays: colours do not mind."""
+    """Return the training images at the size of their cameras. Lens distortion is kept, because it hardly affects
+    colors."""
     files = sorted((SHARED / "captures" / name / "images").iterdir())
     size = (cameras[0].width, cameras[0].height)
     pictures = (Image.open(files[i]).convert("RGB").resize(size) for i in training_indices(name))

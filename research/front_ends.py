@@ -270,7 +270,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small networks and images")
     parser.add_argument("--variants", action="store_true", help="other precisions, compiled encoders, a profile")
-    parser.add_argument("--cold", action="store_true", help="only some images in this process, which are timed")
+    parser.add_argument("--cold", action="store_true", help="only time some images in this process")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     arguments = parser.parse_args()

@@ -317,7 +317,7 @@ def edge_of(site: Site, voters: Voters) -> Tensor:
 def observed_forms(
     site: Site, cell: Cell, seed: int, all_forms: Sequence[Form] = FORMS, *, judge: bool = False
 ) -> dict[str, Any]:
-    """Everything of one observation; with left-out views if asked for."""
+    """Return all figures of one observation; with left-out views if `judge` is True."""
     observed = site.observed(cell, seed)
     words = site.looks if cell.statistic == "histogram" else site.words[cell.statistic]
     classes, voters = words.classes.to(observed.features.device), site.voters
@@ -446,10 +446,10 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", type=int, default=len(SEEDS))
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--chunk", type=int, default=18, help="cells that a process takes at a time")
-    parser.add_argument("--minutes", type=float, default=1e6, help="no observation begins later than this")
+    parser.add_argument("--minutes", type=float, default=1e6, help="minutes after which no observation starts")
     parser.add_argument("--judge", action="store_true", help="measure the recognition of left-out views too")
-    parser.add_argument("--statistics", nargs="+", help="cells of these statistics alone")
-    parser.add_argument("--later", action="store_true", help="the candidates of the second study")
+    parser.add_argument("--statistics", nargs="+", help="run only cells of these statistics")
+    parser.add_argument("--later", action="store_true", help="run the candidates of the second study")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--rows", type=Path, default=RESULTS / "gate_rows.jsonl", help="finished observations")
     main(parser.parse_args())

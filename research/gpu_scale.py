@@ -344,9 +344,9 @@ if __name__ == "__main__":
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     parser.add_argument("--quick", action="store_true", help="tiny scenes and networks")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
-    parser.add_argument("--folder", type=Path, help="of both processes")
+    parser.add_argument("--folder", type=Path, help="folder that both processes share")
     fox = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
-    parser.add_argument("--config", type=Path, default=fox, help="of the run that commands lift")
+    parser.add_argument("--config", type=Path, default=fox, help="config.yml of the run that commands lift")
     given = parser.parse_args()
     if "RANK" in os.environ:
         worker(given.only, given.output, given.folder, given.device, given.quick)

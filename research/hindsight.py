@@ -46,7 +46,7 @@ class Prototype:
         self.median, self.top = np.quantile(self.cosines, (0.5, TOP_QUANTILE))
 
     def reached(self, threshold: float) -> float:
-        """IoU at a threshold as a share of the best."""
+        """Return the IoU at a threshold, relative to the best IoU."""
         return float(self.iou[np.searchsorted(-self.descending, -threshold, side="left")] / self.best)
 
 

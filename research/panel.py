@@ -129,7 +129,9 @@ def add_fox_panel(report: Report) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--load-config", type=Path, help="lifted run; by default the fox capture is lifted first")
-    parser.add_argument("--prompts", nargs="+", default=COLOURS[:4], help="two or more, whose answers look different")
+    parser.add_argument(
+        "--prompts", nargs="+", default=COLOURS[:4], help="two or more prompts whose answers look different"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     found = Report("panel")

@@ -148,7 +148,7 @@ class Observed:
             yield form.name, plain[taken], {"copied": copied, "changed": turned[form] / n}
 
     def lifted(self, form: Form) -> nl.Lifted:
-        """The lift after the consensus of a form, with R of before."""
+        """Return the lift after the consensus of a form, with R from before it."""
         if form.power is None:
             return self.seen
         least = 0.4 if form.old else self.least
@@ -162,7 +162,7 @@ class Observed:
         return self._lifts[key]
 
     def answers(self, form: Form, vectors: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Cosines [N, T] of a form, and its gate and share of copies."""
+        """Return the cosines [N, T] of a form, its gate, and the share that copies."""
         lifted, n = self.lifted(form), len(self.means)
         everyone = torch.arange(n, device=self.means.device)
         plain = torch.cat([lifted.directions(rows) @ vectors.T for rows in everyone.split(2**14)])
@@ -183,7 +183,7 @@ class Observed:
 
 
 def largest(overlaps: Overlaps, least: float) -> Overlaps:
-    """The overlaps of at least J = `least`."""
+    """Return the overlaps with a J of at least `least`."""
     iou = overlaps.iou
     keep = iou.weight >= least
     rows = SparseRows(row_offsets(iou.row_index()[keep], len(iou)), iou.column[keep], iou.weight[keep])
@@ -191,7 +191,7 @@ def largest(overlaps: Overlaps, least: float) -> Overlaps:
 
 
 def average_precision(values: Tensor, truth: Tensor) -> float:
-    """Average precision of pixels with these relevancies."""
+    """Return the average precision of pixels with these relevancies."""
     hit = truth[values.argsort(descending=True, stable=True)].double()
     place = torch.arange(1, len(hit) + 1, device=hit.device)
     return float((hit.cumsum(0) / place * hit).sum() / hit.sum())
@@ -218,7 +218,7 @@ class Capture:
         }
 
     def scores(self, drawn: dict[str, Tensor], texts: list[tuple[str, str]]) -> dict[str, float]:
-        """Average precision of every text from its values in the labeled images, {image: [pixels, T]}."""
+        """Return the average precision of every text from its values in the labeled images, {image: [pixels, T]}."""
         found = {}
         for i, (text, label) in enumerate(texts):
             images = [image for image, labels in self.truth.items() if label in labels]
@@ -334,9 +334,11 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", nargs="+", default=list(CAPTURES), choices=CAPTURES)
     parser.add_argument("--fronts", nargs="+", default=list(FRONTS), choices=list(FRONTS))
-    parser.add_argument("--draws", type=int, default=3, help="choices of few views")
-    parser.add_argument("--later", action="store_true", help="the candidates of `research.gate --later` too")
+    parser.add_argument("--draws", type=int, default=3, help="number of choices of few views")
+    parser.add_argument("--later", action="store_true", help="also run the candidates of `research.gate --later`")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--cache", type=Path, help="folder of features and regions that stays, one folder per capture")
+    parser.add_argument(
+        "--cache", type=Path, help="folder for cached features and regions, with one folder per capture"
+    )
     parser.add_argument("--rows", type=Path, default=RESULTS / "real_gain_rows.jsonl", help="finished rows")
     main(parser.parse_args())

@@ -312,7 +312,7 @@ def main(quick: bool, output: Path, device: str, seconds: float | None) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a smaller network, a few steps")
-    parser.add_argument("--seconds", type=float, help="of training; 120 by default")
+    parser.add_argument("--seconds", type=float, help="seconds of training; 120 by default")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     arguments = parser.parse_args()

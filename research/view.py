@@ -228,8 +228,10 @@ def known_prompt(port: int, run: str, prompt: str, arrays: str) -> list[float]:
 
 
 def million_bytes(share: float) -> float:
-    """Bytes per 1,000,000 Gaussians of SH degree 3 as the page gets them: those of the castle capture, of degree 1.
-    Coefficients of degrees 2 and 3 are those of degree 1 of other Gaussians, times a share.
+    """Return the bytes of the page's data per 1,000,000 Gaussians of SH degree 3.
+
+    The Gaussians are those of the castle capture, of degree 1. Coefficients of degrees 2 and 3 are those of degree 1 of
+    other Gaussians, multiplied by a factor.
     """
     splat, g = trained_state("castle"), torch.Generator().manual_seed(0)
     values = {name: splat[f"gauss_params.{name}"].detach().float() for name in NAMES}
@@ -303,7 +305,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--load-config", type=Path, help="lifted run; by default the fox capture is lifted first")
     parser.add_argument("--prompts", nargs="+", default=COLOURS)
-    parser.add_argument("--no-picture", action="store_true", help="leave Chromium out")
+    parser.add_argument("--no-picture", action="store_true", help="do not measure Chromium")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     found = Report("view")
