@@ -1,20 +1,20 @@
-"""Thresholds suggested from histograms, and verdicts without a null vocabulary, against the truth.
+"""Thresholds suggested from histograms, and verdicts without a null vocabulary, compared with the truth.
 
-    python -m research.honest_answers           plain room, and the tabletop where the captures are
+    python -m research.honest_answers           plain room, and the tabletop if the captures are available
     python -m research.honest_answers --scenes demo
 
-Writes results/honest_answers.json. CLIP-like features are made as in `damage`, of vectors of LVIS names: those of the
-scene's classes (in the plain room 13 names drawn at random), four others as negatives, and 200 others as the unrelated
-words of rule contrast. 60 names more, none closer to a class than a cosine of 0.9, are asked for as well and are in no
-scene. The encoder color sees images of the plain room, cut into superpixels and into squares; words that are not
-in the scene are all names of the XKCD survey whose cosine to every color of the room is below 0.5.
+The command writes results/honest_answers.json. CLIP-like features are made as in `damage` from vectors of LVIS names.
+They use those of the scene's classes (in the plain room, 13 random names), and four others as negatives. 200 further
+names are the unrelated words of rule contrast. 60 more names, whose cosine to every class is below 0.9, are queried
+although no scene contains them. The encoder color uses images of the plain room, divided into superpixels and into
+squares. Its absent words are all names of the XKCD survey whose cosine to every color of the room is below 0.5.
 
 Keys: <scene>.<damage or cut>.<rule>.
-  iou.<threshold>     mean IoU over the classes of what is selected at a threshold: fixed (0.5, colors 0.7), suggested,
-                      Otsu's, and the best for each class, which nobody knows
+  iou.<threshold>     mean IoU over the classes of the selection at a threshold: fixed (0.5, colors 0.7), suggested,
+                      Otsu's, and the best for each class, which needs the truth
   visible.<verdict>   % of the classes that get a verdict
-  absent.<verdict>    % of the words that are not in the scene that get it
-  auc.<statistic>     the chance that a class has more of a statistic than a word that is not in the scene
+  absent.<verdict>    % of the absent words that get it
+  auc.<statistic>     the probability that a statistic is larger for a class than for an absent word
 """
 
 from __future__ import annotations

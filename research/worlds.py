@@ -4,9 +4,9 @@
     python -m research.worlds --processes 16      the same on 16 cores
     python -m research.worlds --quick             two worlds and four rotations of each capture
 
-The cameras of a capture are written in the world of its splat, which is right. Then the splat is turned and scaled by
-what `--world-transform auto` tries, and the cameras are turned by random rotations that are not tried. pale is the fox
-with a tenth of its contrast and with noise of two levels, as sensors add it.
+The cameras of a capture are written in the world of its splat, which is the right one. Then the splat is rotated and
+scaled by the transforms that `--world-transform auto` tries. The cameras are also rotated by random rotations that it
+does not try. pale is the fox with a tenth of its contrast, and with noise of two levels like that of sensors.
 
 Keys: <capture>.right.margin, .psnr and .mean_color of the right world; <capture>.wrong.margin, the largest of the wrong
 ones; <capture>.<world>.found, .margin in the first world, .psnr in the found one, and .seconds of the search;

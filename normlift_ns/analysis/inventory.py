@@ -11,10 +11,10 @@ across their border::
 Here, m is the median number of images per pair. The square root estimates the length of the border, which is a line on
 a surface. This denominator keeps two parts separate if only a few pairs connect them. Initially, every Gaussian is a
 part. Each part joins the part with the largest affinity if that part is larger. This is repeated for affinities of at
-least 0.95, then 0.9, and so on down to 0.5. The method corresponds to the ultrametric contour map of image segmentation
-(Arbelaez et al., "Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of
-edge strengths. Random borders of a segmentation differ between images, so the affinity across them is high. Borders of
-objects are the same in all images, so the affinity across them is low.
+least 0.95, then 0.9, and so on down to 0.5. The method corresponds to the ultrametric contour map of Arbelaez et al.
+("Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of edge strengths.
+Random borders of a segmentation differ between images, so the affinity across them is high. Borders of objects are the
+same in all images, so the affinity across them is low.
 """
 
 from __future__ import annotations

@@ -353,8 +353,8 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
     """Check the options as far as possible without torch.
 
     Raises:
-        InputError: If packages are missing or too old, an option applies only to another encoder, the name is not a hub
-            name, or the folder is incomplete, damaged or of a different architecture.
+        InputError: If packages are missing or too old, or an option applies only to another encoder.
+        InputError: If the name is not a hub name, or the folder is incomplete, damaged or of a different architecture.
         FileNotFoundError: If the folder does not exist, or the network is not on this machine and the hub cannot be
             reached.
     """

@@ -76,7 +76,8 @@ class EncoderKind:
     words: Callable[[], Sequence[str]] = tuple
     """Function that returns the words that name objects in an inventory, or () if there are none."""
     suggested: tuple[float, float] = (0.4, 0.8)
-    """Range of suggested thresholds, on a scale from 0 at the median relevancy to 1 at the top relevancy."""
+    """Range of suggested thresholds. 0 is the median relevancy, and 1 is the relevancy that 20 Gaussians exceed, or one
+    in a thousand if these are fewer."""
     present_from: tuple[float, float] | None = None
     """Lower limits, for a weak match and for a match, on the cosine that one Gaussian in a thousand exceeds. None: the
     null vocabulary, or the relevancy rule, has the limits."""
@@ -366,8 +367,8 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
         device: Device of the network, such as "cuda"; results are always on the CPU.
     Raises:
         ValueError: If the encoder, the model or the weights tag is unknown, or the prompt template has no placeholder.
-        ValueError: If an option does not apply to the encoder, a package that it needs is missing or too old, or an
-            encoder of another package rejects the options.
+        ValueError: If an option does not apply to the encoder, or a required package is missing or too old.
+        ValueError: If an encoder of another package rejects the options.
         FileNotFoundError: If a weight file or model folder does not exist.
     """
     from normlift_ns.encoders.plugins import PluginEncoder  # noqa: PLC0415 (needs torch)

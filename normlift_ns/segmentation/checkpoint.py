@@ -29,7 +29,7 @@ WEIGHTS_FILE = SAM_WEIGHT_FILES[0]
 _MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
 """Upper bounds on numbers of layers, labels and entries, on all other numbers of a config, and on its nesting depth."""
 _MIN_TORCH = "2.6"
-_ALTERNATIVE = "use the original SAM with --regions sam --sam-model sam_vit_h_4b8939.pth (a file published by Meta)"
+_ALTERNATIVE = "lift with the original SAM: --regions sam --sam-model sam_vit_h_4b8939.pth (a file published by Meta)"
 _SAM_CONFIGS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
 _NOT_SIZES = re.compile(
     r"(?s)_|.*attn_impl|(auto_map|quantization_config|architectures|dtype|torch_dtype|transformers_version)\Z"
