@@ -475,7 +475,11 @@ class RecordedVotes:
             )
 
     def _option(self, name: str, kind: type, default: Any) -> Any:
-        """Return an option of the lift, or the default if the manifest does not record it."""
+        """Return an option of the lift, or the default if the manifest does not record it.
+
+        Raises:
+            InputError: If the recorded value has the wrong type.
+        """
         options = self.field.manifest.get("options")
         value = options.get(name, default) if isinstance(options, Mapping) else default
         if not isinstance(value, (int, float) if kind is float else kind):

@@ -212,7 +212,7 @@ class LangSplat:
 
     @cached_property
     def folder(self) -> Path:
-        """Folder that contains the files of the images: `root`, or a folder inside it."""
+        """Folder that contains the files of the images: `root`, or a folder inside it. Raises the same errors as the class."""
         folders = [self.root, self.root / _NESTED, self.root / _NESTED / _NESTED]
         for folder in folders:
             if os.path.isdir(folder) and next(folder.glob("*_s.npy"), None) is not None:
@@ -293,7 +293,10 @@ class LangSplat:
         return self.texts.text(prompts)
 
     def _files(self, name: str) -> _Files:
-        """Return the files of an image. LangSplat cuts image names at the first dot, other programs at the last."""
+        """Return the files of an image, or raise FileNotFoundError if it has none.
+
+        LangSplat cuts image names at the first dot, and other programs at the last.
+        """
         file = PurePosixPath(name)
         for stem in (file.stem, file.name.split(".")[0]):
             files = _Files(self.folder / f"{stem}_s.npy", self.folder / f"{stem}_f.npy")

@@ -78,7 +78,7 @@ def missing_patches_reason(model: str) -> str | None:
 
 
 def _folder() -> Path:
-    """Return the folder of the open_clip package."""
+    """Return the folder of the open_clip package; raise InputError if it is not installed."""
     spec = find_spec("open_clip")
     if spec is None or spec.origin is None:
         raise InputError(

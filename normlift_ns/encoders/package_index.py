@@ -89,7 +89,7 @@ def manual_copy(file: PackageFile) -> str:
 
 
 def _download(file: PackageFile) -> bytes:
-    """Download the wheel without checking its content."""
+    """Download the wheel without checking its content; raise FileNotFoundError if this fails."""
     problems = []
     for download in (_download_with_pip, _download_from_indexes):
         try:
@@ -199,6 +199,8 @@ def _get(opener: urllib.request.OpenerDirector, url: str, page: str, most: int) 
     Args:
         page: URL of the index page. Its user name and password are sent only to the same scheme, host and port.
         most: Largest number of bytes to read.
+    Raises:
+        OSError, ValueError: If the download fails, or has more than `most` bytes.
     """
     address, _ = _without_password(url)
     request = urllib.request.Request(address, headers={"Accept": _ACCEPT if url == page else "*/*"})

@@ -789,7 +789,7 @@ def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str |
 def coverage_of(
     scene: Scene, field: SemanticField, *, min_reliability: float = RELIABLE, device: str = "cpu"
 ) -> Coverage:
-    """Compute `coverage` of a scene and its semantic field."""
+    """Compute `coverage` of a scene and its semantic field. Raises the same errors."""
     check_number("min_reliability", min_reliability)
     images = study_images(scene, field.manifest)
     power, vote = field.manifest.get("options", {}).get("weight_power", 1), recorded_vote(field.manifest)

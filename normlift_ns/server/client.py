@@ -293,7 +293,12 @@ class RemoteRun:
 
     @check_arguments
     def camera(self, view: str | int) -> Camera:
-        """Return the camera of the training image with the name or index `view`."""
+        """Return the camera of the training image with the name or index `view`.
+
+        Raises:
+            ValueError: No image, or more than one image, has this name or index.
+            OSError: The server does not respond.
+        """
         cameras = json.loads(self._get(self._path("cameras")))["cameras"]
         if isinstance(view, int):
             matches = cameras[view : view + 1] if view >= 0 else []

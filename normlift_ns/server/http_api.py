@@ -150,7 +150,11 @@ def coverage_of(served: ServedRun, query: Any) -> dict[str, Any]:
 
 
 def features(served: ServedRun, query: Any) -> Content:
-    """Return the unit features [M, D] of a range of Gaussians as an NPY file; Gaussians without a direction have 0."""
+    """Return the unit features [M, D] of a range of Gaussians as an NPY file; Gaussians without a direction have 0.
+
+    Raises:
+        ValueError: The range is empty, exceeds the scene, or has more than `MAX_FEATURES` Gaussians.
+    """
     count = len(served.space)
     start, stop = (int(_number(name, query.get(name, str(end)))) for name, end in (("start", 0), ("stop", count)))
     if not 0 <= start < stop <= count or stop - start > MAX_FEATURES:

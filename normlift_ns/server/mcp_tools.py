@@ -174,7 +174,10 @@ def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
 
 
 def _guarded(server: WarmServer, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a coroutine function that calls `function` in a thread and removes absolute paths from its errors."""
+    """Return a coroutine function that calls `function` in a thread.
+
+    It raises ToolError for every error, with the message without absolute paths.
+    """
 
     @wraps(function)
     async def run(**arguments: Any) -> Any:

@@ -295,7 +295,11 @@ class ServedRun:
         return msgspec.structs.replace(view, position=position, look_at=tuple(target.center))
 
     def image(self, index: int, max_size: int) -> bytes:
-        """Return a training image as JPEG, with at most `max_size` pixels along its longer side."""
+        """Return a training image as JPEG, with at most `max_size` pixels along its longer side.
+
+        Raises:
+            ValueError: The run has no image with this index.
+        """
         if not 0 <= index < len(self.run.scene.train):
             raise InputError(
                 f"The run has no image {index}. It has {len(self.run.scene.train)} images, numbered from 0."

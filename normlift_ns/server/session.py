@@ -160,7 +160,12 @@ class PageSession:
         return self._memory.history.now
 
     async def run(self) -> None:
-        """Serve the page until its connection ends."""
+        """Serve the page until its connection ends.
+
+        Raises:
+            ValueError: The first message is not a greeting.
+            TimeoutError: The first message does not arrive in time.
+        """
         with anyio.fail_after(_GREETING_TIMEOUT):
             first = protocol.read_message(await self._socket.receive_text())
         if first.action != "greet":
