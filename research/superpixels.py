@@ -18,8 +18,8 @@ This rule was written before the first run. On a GPU, this package's superpixels
 are at most 0.5 points worse. These are boundary recall and undersegmentation error at 256, their means over the three
 numbers, average precision, and best IoU. On CPUs, they must also take less CPU time per image of the fox.
 
-Result: all figures are better: boundary recall by 3 to 6 points, average precision by 7, best IoU by 5. On 2 cores, this
-package takes 0.11 s of CPU per image, and scikit-image 0.56 s. Its superpixels replace scikit-image's everywhere.
+Result: all figures are better: boundary recall by 3 to 6 points, average precision by 7, best IoU by 5. On 2 cores,
+this package takes 0.11 s of CPU per image and scikit-image 0.56 s. Its superpixels replace scikit-image's everywhere.
 """
 
 from __future__ import annotations

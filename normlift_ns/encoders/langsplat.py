@@ -212,7 +212,11 @@ class LangSplat:
 
     @cached_property
     def folder(self) -> Path:
-        """Folder that contains the files of the images: `root`, or a folder inside it. Raises the same errors as the class."""
+        """Folder that contains the files of the images: `root`, or a folder inside it.
+
+        Raises:
+            FileNotFoundError: For the same reasons as the class.
+        """
         folders = [self.root, self.root / _NESTED, self.root / _NESTED / _NESTED]
         for folder in folders:
             if os.path.isdir(folder) and next(folder.glob("*_s.npy"), None) is not None:

@@ -289,7 +289,9 @@ class ServedRun:
         """
         view = view or self.first_view
         if view is None:
-            raise InputError("The camera of the page is not known yet. Move the camera, and try again.")
+            raise InputError(
+                "No camera is known, and the run has no training images. Move the camera of the page, and try again."
+            )
         scene = self.run.scene.gaussians
         position = unoccluded_viewpoint(target, scene, drawn, view.position, view.up, view.fov)
         return msgspec.structs.replace(view, position=position, look_at=tuple(target.center))
