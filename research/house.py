@@ -117,7 +117,8 @@ def complexity(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 
 def imported(tree: ast.Module, modules: set[str]) -> set[str]:
-    """Return the modules of this package that a module imports at once or lazily, without imports for types alone."""
+    """Return the modules of this package that a module imports, at its start or lazily, without imports for types
+    alone."""
     found: set[str] = set()
 
     def walk(node: ast.AST) -> None:

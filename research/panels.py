@@ -62,13 +62,13 @@ class Observed:
     """A training image as processed by the lift."""
 
     image: Tensor
-    """[H, W, 3] RGB, 0..255"""
+    """[H, W, 3] RGB, in 0..255."""
     region: Tensor
-    """[H, W] region of every pixel in the (first) level of the lift; -1: none."""
+    """[H, W] region of every pixel in the (first) level of the lift, or -1 for none."""
     features: Tensor
     """[R, D] unit rows."""
     cells: Tensor
-    """[H, W]"""
+    """[H, W] cell of every pixel, or -1 for none."""
     regions: Tensor
     """[levels, C] region of every cell."""
 

@@ -27,7 +27,11 @@ CAPTURES = ("fox", "tabletop")
 
 
 def planned(trained: Path, folder: Path, name: str, *flags: object) -> dict[str, float]:
-    """Return the estimated seconds of every stage and `total`, and `wall`, the time of the check itself."""
+    """Return the estimates of a check and its own time.
+
+    The keys are the stages and `total` in seconds, `wall` for the time of the check itself, and `gib` and `gpu_gib` for
+    memory.
+    """
     file = folder / "plan.json"
     given = (
         "--load-config",

@@ -18,7 +18,7 @@ FLOOR = 1e-4
 
 
 def plots(found: Documents, folder: Path) -> Iterator[Path]:
-    """Draw all plots, and return their paths."""
+    """Draw all plots, and yield their paths."""
     accuracy, fit, signals = (found[name] for name in ("accuracy", "fit", "signals"))
     yield plot_presets(found["presets"], folder / "presets.svg")
     yield plot_accuracy(accuracy, folder / "accuracy.svg")

@@ -60,7 +60,7 @@ def page() -> str:
 
 
 def section(name: str, command: type) -> str:
-    """Return the options of one command, without those that it shares with ns-normlift."""
+    """Return the options of one command, or of a command that inherits those of ns-normlift, only its own."""
     inherited = {field.name for field in dataclasses.fields(NormLift)} if command is not NormLift else set()
     inherits = issubclass(command, NormLift) and command is not NormLift
     fields = [f for f in dataclasses.fields(command) if not (inherits and f.name in inherited)]

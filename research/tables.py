@@ -316,8 +316,7 @@ def numerics_cases() -> str:
 
 
 def numerics_errors(cpu: Document, gpu: Document) -> str:
-    """Return the errors of every hard case on both kinds of device, with bounds in brackets that differ from the
-    default."""
+    """Return the errors of every hard case on both kinds of device, with their bounds."""
     rows = []
     for case in CASES:
         for name in (x for x in QUANTITIES if f"{case.key}.{x}" in cpu.values and not x.endswith(DOUBLE)):

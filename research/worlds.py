@@ -53,7 +53,7 @@ from tests.data.scene_files import in_file_world, in_world, ply_columns, write_c
 CAPTURES = ("fox", "castle", "tabletop", "pale")
 FACTORS = (1.0, 1.01, 1.02, 1.05, 1.5)
 ROTATIONS = 50
-"""Random rotations of each capture."""
+"""Number of random rotations of each capture."""
 _QUARTER = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 TURNS = {
     "half_x": np.diag([1.0, -1, -1]),
