@@ -1,17 +1,17 @@
-"""Accuracy where the truth is known: the refinement's variants and other methods over a ladder of damage.
+"""Accuracy on scenes with known truth: variants of the refinement and other methods, over a ladder of damage.
 
     python -m research.accuracy                     tabletop and plain room, every Gaussian votes; for a GPU
     python -m research.accuracy --voters 4000 --views 22
                                                       for CPUs: a sample votes and counts, half of the tabletop's views,
                                                       no 2D accuracy, no A^2 and top-k weights
     python -m research.accuracy --quick             plain room of 20,000 Gaussians, three steps of the ladder, 2 seeds
-    python -m research.accuracy --minutes 9         no new observation after so many minutes; the same command goes on
+    python -m research.accuracy --minutes 9         start no observation after this many minutes; repeat to continue
 
-Writes results/accuracy.json: means over seeds with 95 % intervals (Student's t), in points (per cent). Keys without a
-scene in front are of all scenes. `ablation` is the 13 steps of version 0.1's ladder, `undamaged` its step "noise only",
-`views3` its steps with 3 views, but for "few views"; each says of every method its mean, its gain over no refinement,
-the worst observation, the share of observations that are worse, and the share of Gaussians that copy. The steps that
-came later are in `ladder` alone. Every finished observation is one line of `--rows`.
+The command writes results/accuracy.json: means over seeds with 95 % intervals (Student's t), in percentage points. Keys
+without the name of a scene pool all scenes. `ablation` covers the 13 steps of version 0.1's ladder, `undamaged` its
+step "noise only", and `views3` its steps with 3 views, except "few views". For each method, they contain the mean, the
+gain over no refinement, the worst observation, the share of observations that are worse, and the share of Gaussians
+that copy a direction. Later steps are only in `ladder`. Each finished observation is one line of the file `--rows`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ SEEDS = 8
 
 
 def scores_2d(world: World, scores: Scores) -> dict[str, float]:
-    """mIoU of composited scores in the sampled pixels of the held-out views, in points."""
+    """Return the mIoU of composited scores in the sampled pixels of the held-out views, in percentage points."""
     rows, truth = world.pixels
     image = torch.zeros(len(truth), world.classes, device=scores.cosine.device)
     weight = rows.weight.to(image)[:, None]
@@ -62,14 +62,14 @@ def scores_2d(world: World, scores: Scores) -> dict[str, float]:
 
 
 def scores_3d(world: World, scores: Scores, counted: Tensor) -> dict[str, float]:
-    """mIoU and mAcc over Gaussians, in points."""
+    """Return mIoU and mAcc over Gaussians, in percentage points."""
     found = classify(scores.cosine[counted], scores.valid[counted])
     result = class_scores(confusion(world.truth[counted], found, world.classes))
     return {"miou": 100 * result.miou, "macc": 100 * result.macc}
 
 
 class Bench:
-    """One scene, with what does not depend on damage."""
+    """A scene with the data that all observations of it share."""
 
     def __init__(self, world: World, words: Words, voters: int | None, device: str, config: RefineConfig) -> None:
         self.world, self.words, self.config = world.to(device), words, config
@@ -86,10 +86,10 @@ class Bench:
             self.others["drsplat"] = replace(self.world, evidence=top_evidence(self.world))
 
     def run(self, damage: Damage, seed: int, *, others: bool = True) -> dict[str, Any]:
-        """All methods on one observation.
+        """Return the scores of all methods on one observation.
 
         Args:
-            others: with accuracy in 2D, presets, other methods and bins of reliability.
+            others: True to include accuracy in 2D, presets, other methods and bins of reliability.
         """
         world, known = self.world, self.world.truth >= 0
         observed = observe(world, self.words, damage, seed)
@@ -120,7 +120,7 @@ class Bench:
         return row
 
     def _refined(self, variant: Variant, lifted: Lifted, plain: Scores) -> tuple[Scores, float]:
-        """Scores after a variant, and the share of the counted Gaussians that copy."""
+        """Return the scores after a variant, and the share of the counted Gaussians that copy a direction."""
         means = self.world.scene.means
         if variant in ("none", "linear"):
             return refined_scores(variant, means, lifted, plain, self.voting, self.config), 0.0
@@ -130,7 +130,7 @@ class Bench:
         return Scores(plain.cosine[source], plain.valid[source]), copied
 
     def _presets(self, observed: Observed, lifted: Lifted, plain: Scores) -> dict[str, Any]:
-        """The default vote by faster lifts, as in `research.presets`."""
+        """Return the scores of the default vote after faster lifts, as in `research.presets`."""
         means = self.world.scene.means
         read = partial(lifted.directions, dtype=torch.float16)
         given = {"own": lifted.scalars.own_evidence, "neighbors": self.neighbors}
@@ -146,7 +146,11 @@ class Bench:
 
 
 def worlds(quick: bool, names: Sequence[str], views: int | None = None) -> Iterator[tuple[World, Words]]:
-    """The scenes and the vectors of their classes; `views` training views of the tabletop."""
+    """Yield the scenes and the vectors of their classes.
+
+    Args:
+        views: Number of training views of the tabletop, or None for all.
+    """
     if "tabletop" in names and not quick:
         yield tabletop(views), real_words()
     if "demo" in names:
@@ -155,7 +159,7 @@ def worlds(quick: bool, names: Sequence[str], views: int | None = None) -> Itera
 
 
 def steps_to_run(quick: bool) -> dict[str, Damage]:
-    """Damages by name: the ladder, what came after it, and the ladder with 3 views."""
+    """Return damages by name: the ladder, the later steps, and the ladder with 3 views."""
     if quick:
         return {name: LADDER[name] for name in ("mild", "few views", "hard")}
     fewer = {name + THREE: replace(damage, views=3) for name, damage in LADDER.items() if name != "few views"}
@@ -163,7 +167,7 @@ def steps_to_run(quick: bool) -> dict[str, Damage]:
 
 
 def run_all(arguments: argparse.Namespace, seeds: int, voters: int | None, deadline: float) -> list[dict[str, Any]]:
-    """One row per scene, damage and seed, until the deadline (`time.time`)."""
+    """Return one row per scene, damage and seed, and stop at the deadline (`time.time`)."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     steps, path = steps_to_run(arguments.quick), arguments.rows
     run = {"seeds": seeds, "voters": voters, "views": arguments.views, "quick": arguments.quick}
@@ -215,7 +219,9 @@ if __name__ == "__main__":
     parser.add_argument("--views", type=int, help="training views of the tabletop; all by default")
     parser.add_argument("--seeds", type=int, default=SEEDS, help="repeats")
     parser.add_argument("--scenes", nargs="+", default=["tabletop", "demo"], help="tabletop, demo")
-    parser.add_argument("--minutes", type=float, help="no observation begins later than this")
-    parser.add_argument("--rows", type=Path, default=RESULTS / "accuracy_rows.jsonl", help="finished observations")
+    parser.add_argument("--minutes", type=float, help="minutes after which no observation starts")
+    parser.add_argument(
+        "--rows", type=Path, default=RESULTS / "accuracy_rows.jsonl", help="file of finished observations"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     main(parser.parse_args())

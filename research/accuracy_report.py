@@ -1,4 +1,4 @@
-"""What the rows of `research.accuracy` come to: means with intervals, worst cases, and shares."""
+"""Summary of the rows of `research.accuracy`: means with intervals, worst cases and shares."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from research.variants import VARIANTS
 VARIES = 0.05
 """Accuracy varies over bins of reliability if their means span at least this much."""
 WORSE = 1.0
-"""Points of an observation by which a method is worse than no refinement."""
+"""A method is worse than no refinement in an observation if it loses more than this number of percentage points."""
 AGREED: dict[str, Variant] = {
     "consensus": "none", "consensus_paper": "paper", "consensus_posterior": "posterior",
 }  # fmt: skip
-"""What follows the consensus, by the method's name."""
+"""Variant of the vote after the consensus, by the name of the method."""
 VOTES: dict[str, Variant] = {**{name: name for name in VARIANTS}, **AGREED}
 METHODS = tuple(VOTES)
 THREE = ", 3 views"
-"""Ends the names of steps with 3 views."""
+"""End of the names of steps with 3 views."""
 PRESETS = ("preset_half", "preset_every_second_view")
 OTHERS = {"sfs": "A^2 weights", "occam": "centre pixels", "vala": "gated geometric median", "drsplat": "top-k rays"}
 
 
 def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean over seeds and half the width of its 95 % interval."""
+    """Return the mean over seeds and half the width of its 95 % interval."""
     n = len(values)
     half = stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / n**0.5 if n > 1 else float("nan")
     return float(np.mean(values)), float(half)
 
 
 def summarize(rows: list[dict[str, Any]], report: Report) -> None:
-    """Means with intervals of every step and over the ladder; of all scenes together, and of each."""
+    """Add means with intervals of each step and over the ladder, for all scenes together and for each scene."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     for scene in ("", *scenes):
         prefix = f"{scene}." if scene else ""
@@ -71,7 +71,7 @@ def summarize(rows: list[dict[str, Any]], report: Report) -> None:
 
 
 def _by_seed(rows: Sequence[dict[str, Any]], method: str, metric: str) -> list[float]:
-    """Mean over scenes and steps, of every seed."""
+    """Return the mean over scenes and steps for each seed."""
     seeds = sorted({row["seed"] for row in rows})
     return [float(np.mean([row[method][metric] for row in rows if row["seed"] == seed])) for seed in seeds]
 
@@ -92,7 +92,7 @@ def _worse(rows: Sequence[dict[str, Any]], method: str) -> tuple[float, str]:
 
 
 def _add_method(report: Report, key: str, rows: Sequence[dict[str, Any]], method: str) -> None:
-    """What the docs say of a method on some steps."""
+    """Add the figures of a method that the documentation shows, over some steps."""
     for metric in (name for name in rows[0][method] if name != "copied"):
         _add_mean(report, f"{key}.{metric}", _by_seed(rows, method, metric))
     gains = _difference(rows, method, "none")
@@ -105,7 +105,7 @@ def _add_method(report: Report, key: str, rows: Sequence[dict[str, Any]], method
 
 
 def _add_reliability(rows: list[dict[str, Any]], steps: Sequence[str], prefix: str, report: Report) -> None:
-    """Spearman between ten bins by R (or ||f||) and their accuracy, means over seeds, per step of the ladder."""
+    """Add Spearman's correlation between ten bins by R (or ||f||) and their accuracy, per step of the ladder."""
     varying = {"reliability": [], "norm": []}
     for step in steps:
         for name, found in varying.items():

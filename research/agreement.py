@@ -1,11 +1,11 @@
-"""Where the consensus stays off: what its least agreement B costs where regions are things, and saves elsewhere.
+"""Gain of the consensus with and without its smallest agreement B, for masks of objects and for other regions.
 
     python -m research.agreement           four rooms made in code, two minutes on a GPU
     python -m research.agreement --quick   the plain room of 5,000 Gaussians, two steps, one seed
 
-Regions are masks, damaged by every step of the ladder, and partitions that know of no things: squares, and superpixels
-of the rendered views. A region of a partition is called by the mean of what its pixels are called. Writes
-results/agreement.json: B, and points of mIoU gained over the lift alone, as it is and with
+The regions are masks, damaged by each step of the ladder, and partitions that ignore objects: squares, and superpixels
+of the rendered views. The feature of such a region is the mean over its pixels of their classes, with noise. The
+command writes results/agreement.json: B, and the points of mIoU gained over the lift alone with the default and with
 `--consensus-min-agreement 0`.
 """
 
@@ -37,11 +37,11 @@ from tests.plain_room import plain_room
 
 SEEDS, GAUSSIANS = 4, 20_000
 SQUARES, SUPERPIXELS = (32, 64, 96), (30, 100, 300)
-"""Pixels along a side, in pictures of 320; superpixels per view, about."""
+"""Side of the squares in pixels, in images 320 pixels wide, and approximate number of superpixels per view."""
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-"""Where scenes are rasterized."""
+"""Device that rasterizes the scenes."""
 NOISE = 0.5
-"""Length of what is added to the unit feature of every region of a partition."""
+"""Length of the noise that is added to the unit feature of every region of a partition."""
 
 
 def _room(make: Callable[[int], DemoRoom]) -> Callable[[int], World]:
@@ -53,7 +53,7 @@ ROOMS = {"demo": _room(demo_room), "plain": _room(plain_room), "second": second,
 
 
 def partitions(world: World) -> Iterator[tuple[str, list[Tensor]]]:
-    """Names and label maps [H, W] of every view."""
+    """Yield the name of each partition and its label maps [H, W] of all views."""
     views, height, width = world.cells.maps.shape
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     for side in SQUARES:
@@ -67,7 +67,7 @@ def partitions(world: World) -> Iterator[tuple[str, list[Tensor]]]:
 
 
 def called(labels: list[Tensor], maps: Tensor, classes: Tensor) -> Tensor:
-    """Unit features of the regions of a partition: the mean of their pixels' classes, with noise."""
+    """Return unit features of the regions of a partition: the mean class vector of their pixels, with noise."""
     g, out = torch.Generator().manual_seed(0), []
     for regions, truth in zip(labels, maps):
         known = truth >= 0
@@ -79,7 +79,7 @@ def called(labels: list[Tensor], maps: Tensor, classes: Tensor) -> Tensor:
 
 
 def gains(world: World, words: Words, evidence: Evidence, features: Tensor) -> dict[str, float]:
-    """B, and points of mIoU gained by the consensus as it is and with a least B of 0."""
+    """Return B, and the points of mIoU gained by the consensus with its default smallest B and with 0."""
     default, always = consensus(evidence, features), consensus(evidence, features, least=0.0)
     known = (world.truth >= 0).nonzero().squeeze(1)
     alone, as_it_is, unlimited = (
@@ -90,7 +90,7 @@ def gains(world: World, words: Words, evidence: Evidence, features: Tensor) -> d
 
 
 def observations(name: str, *, quick: bool) -> Iterator[tuple[str, dict[str, float]]]:
-    """Kinds of regions, and what the consensus gains with them; a kind as often as it has seeds."""
+    """Yield kinds of regions with the gains of the consensus. Each damage step occurs once per seed."""
     world = ROOMS[name](5000 if quick else GAUSSIANS)
     words = made_words(world.classes)
     for step in ("mild", "hard") if quick else LADDER:
@@ -103,7 +103,10 @@ def observations(name: str, *, quick: bool) -> Iterator[tuple[str, dict[str, flo
 
 
 def by_regions(found: Document) -> str:
-    """Rows of kinds of regions: B, the gain, and that with a least B of 0, in the demo room and in the three others."""
+    """Return a table with a row per kind of region: B, the gain, and the gain with a smallest B of 0.
+
+    It has one group of columns for the demo room, and one for the three other rooms.
+    """
     kinds = [key.removeprefix("demo.").removesuffix(".agreement") for key in found.values if key.startswith("demo.")]
     rows = []
     for kind in (x for x in kinds if "." not in x):

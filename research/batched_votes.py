@@ -1,7 +1,7 @@
-"""Many votes at once: the cosines among the neighbours of every voter are computed once per feature table.
+"""Many votes that share the cosines between the neighbors of every voter, computed once per feature table.
 
-`refine` computes them again for every vote, which is what a single lift needs. The formulas are its own; tests compare
-the two. Cosines are kept in half precision on a GPU.
+`refine` computes the cosines for each vote, which suits a single lift. The formulas are the same, and tests compare
+both. On a GPU, cosines are stored in half precision.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from research.candidates import Candidate
 from research.variants import Scores, lifted_scores
 
 CHUNK = {"cpu": 2**9, "cuda": 2**14}
-"""Voters at a time."""
+"""Number of voters to process at a time, by device type."""
 
 
 class Result(NamedTuple):
-    """Of one candidate."""
+    """Result of one candidate."""
 
     miou: float
-    """Points."""
+    """mIoU in percentage points."""
     copied: float
     """Share of the voters that take another Gaussian's direction."""
 
 
 @dataclass(frozen=True)
 class Voters:
-    """Who votes, and among whom."""
+    """Voters with their neighbors."""
 
     group: Tensor
-    """[M, K + 1] a voter and its neighbours, -1 where there are fewer."""
+    """[M, K + 1] index of each voter and of its neighbors, or -1 for missing neighbors."""
     distance: Tensor
-    """[M, K + 1] in units of the scene's median spacing, inf where there is none."""
+    """[M, K + 1] distance in units of the scene's median spacing, or inf for missing neighbors."""
     truth: Tensor
-    """[M]"""
+    """[M] class of each voter."""
     classes: int
 
 
 def voters_of(neighbors: Neighbors, truth: Tensor, classes: int, some: Tensor | None = None) -> Voters:
-    """Those whose class is known, or some of them."""
+    """Return all Gaussians with a known class, or the Gaussians `some`, as voters."""
     chosen = (truth >= 0).nonzero().squeeze(1) if some is None else some
     finite = neighbors.spacing[neighbors.spacing.isfinite()]
     group = torch.cat([chosen[:, None], neighbors.index[chosen].long()], dim=1)
@@ -54,7 +54,7 @@ def voters_of(neighbors: Neighbors, truth: Tensor, classes: int, some: Tensor | 
 
 
 def results(candidates: Sequence[Candidate], lifted: Lifted, voters: Voters, classes: Tensor) -> dict[str, Result]:
-    """mIoU of the voters, and how many copy, for candidates of the same feature table.
+    """Return the mIoU of the voters and the share that copies, for candidates of the same feature table.
 
     Args:
         classes: [K, D] vectors of the classes.
@@ -78,7 +78,7 @@ def results(candidates: Sequence[Candidate], lifted: Lifted, voters: Voters, cla
 
 
 def gates_of(candidates: Sequence[Candidate]) -> dict[tuple[float, float], list[Candidate]]:
-    """Candidates that vote, by tau and gamma, whose sigmoid they share."""
+    """Return the candidates that vote by tau and gamma, because equal values share a sigmoid."""
     found: dict[tuple[float, float], list[Candidate]] = {}
     for one in candidates:
         if one.vote not in ("none", "linear"):
@@ -87,7 +87,7 @@ def gates_of(candidates: Sequence[Candidate]) -> dict[tuple[float, float], list[
 
 
 def mious(answers: Tensor, voters: Voters) -> list[float]:
-    """mIoU in points of answers [V, M]."""
+    """Return the mIoU of each row of answers [V, M], in percentage points."""
     k = voters.classes
     key = voters.truth * (k + 1) + torch.where(answers < 0, k, answers)
     key = key + torch.arange(len(answers), device=key.device)[:, None] * k * (k + 1)
@@ -97,7 +97,7 @@ def mious(answers: Tensor, voters: Voters) -> list[float]:
 
 @dataclass(frozen=True)
 class _Part:
-    """Some voters with all that votes read."""
+    """Some voters with all inputs of their votes."""
 
     group: Tensor
     distance: Tensor
@@ -105,10 +105,10 @@ class _Part:
     """[m, K + 1, K + 1] cosines."""
     norm: Tensor
     n_eff: Tensor
-    """[m, K + 1], 0 where there is nobody."""
+    """[m, K + 1], 0 for missing neighbors."""
 
     def reliability(self, vote: str) -> Tensor:
-        """[m, K + 1] R that a vote reads, as `variant_reliability`."""
+        """Return [m, K + 1], the R that a vote uses; see `variant_reliability`."""
         if vote == "plain_knn":
             return (self.norm > 0).to(self.norm)
         if vote == "norm_only":
@@ -117,14 +117,14 @@ class _Part:
         return support if vote == "support_only" else self.norm * support
 
     def sources(self, candidates: Sequence[Candidate], tau: float, gamma: float) -> list[Tensor]:
-        """[m] whose direction every voter takes by each candidate, as `refine` finds it."""
+        """Return, for each candidate, [m] the Gaussian whose direction each voter takes, as in `refine`."""
         terms = [self.terms(one) for one in candidates]
         gate = torch.sigmoid((self.gram.float() - tau) / gamma)
         agreed = torch.bmm(gate, torch.stack([weight.float() for _, weight, _ in terms], dim=2))
         return [self._winners(r, agreed[:, :, i], margin) for i, (r, _, margin) in enumerate(terms)]
 
     def terms(self, one: Candidate) -> tuple[Tensor, Tensor, Tensor | float]:
-        """R and weights [m, K + 1], and the margin that the best neighbour must win by."""
+        """Return R and weights [m, K + 1], and the margin by which the best neighbor must win."""
         r, square = self.reliability(one.vote), (self.distance / one.sigma_d) ** 2
         if one.vote != "posterior":
             nearest = torch.where(r > 0, square, torch.inf).amin(1)
@@ -141,7 +141,7 @@ class _Part:
         return torch.where(wins, self.group.gather(1, choice[:, None] + 1).squeeze(1), self.group[:, 0])
 
     def averaged(self, one: Candidate, scores: Scores) -> Tensor:
-        """[m] class after linear averaging."""
+        """Return [m], the class after linear averaging."""
         r = self.reliability(one.vote)
         weight = r * _decay(r, (self.distance / one.sigma_d) ** 2)
         total = torch.einsum("mk,mkc->mc", weight, scores.cosine[self.group.clamp(min=0)])
@@ -151,7 +151,7 @@ class _Part:
 
 
 def _decay(r: Tensor, square: Tensor) -> Tensor:
-    """d_ik, counted from the nearest reliable one."""
+    """Return d_ik relative to the nearest reliable neighbor."""
     nearest = torch.where(r > 0, square, torch.inf).amin(1, keepdim=True)
     return torch.exp(-0.5 * (square - nearest).nan_to_num(0, posinf=torch.inf).clamp(min=0))
 

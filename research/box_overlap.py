@@ -1,4 +1,4 @@
-"""How far two oriented boxes agree: the volume of their intersection over that of their union."""
+"""Intersection over union of two oriented boxes, by volume."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from normlift_ns.analysis.objects import OrientedBox
 
 
 def half_spaces(box: OrientedBox) -> np.ndarray:
-    """[6, 4] normal and offset of the six faces: a point p lies inside where normal @ p + offset <= 0."""
+    """Return [6, 4], the normal and offset of the six faces; a point p is inside if normal @ p + offset <= 0."""
     axes, center, size = box.axes.numpy(), box.center.numpy(), box.size.numpy()
     along = axes @ center
     upper = np.column_stack([axes, -along - size / 2])
@@ -18,8 +18,10 @@ def half_spaces(box: OrientedBox) -> np.ndarray:
 
 
 def intersection_volume(first: OrientedBox, second: OrientedBox) -> float:
-    """Of two convex polytopes: the largest ball inside of both (a linear programme) gives a point inside, the faces
-    around it the corners (qhull), and these the volume. 0 where they have no inside in common.
+    """Return the volume of the intersection of two boxes, or 0 if they share no interior point.
+
+    A linear program finds the largest ball inside both boxes, whose center is an interior point. From this point, qhull
+    computes the corners of the intersection and its volume.
     """
     from scipy.optimize import linprog  # noqa: PLC0415 (slow)
 
@@ -39,7 +41,7 @@ def intersection_volume(first: OrientedBox, second: OrientedBox) -> float:
 
 
 def box_iou(first: OrientedBox, second: OrientedBox) -> float:
-    """In 0..1; 0 for boxes without volume."""
+    """Return the intersection over union of two boxes, in 0..1, or 0 for boxes without volume."""
     common = intersection_volume(first, second)
     union = float(first.size.prod() + second.size.prod()) - common
     return common / union if union > 0 else 0.0

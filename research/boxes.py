@@ -1,9 +1,9 @@
-"""Boxes of the tabletop's objects from exact and from damaged masks, against boxes of the true Gaussians.
+"""Boxes of the tabletop's objects from exact and from damaged masks, compared with boxes of the true Gaussians.
 
     python -m research.boxes --views 16
 
-True Gaussians are those of the controlled benchmark (`research.synthetic_scenes.PURITY`). Boxes are made of both
-alike, but the objects found are connected parts, of which the largest counts.
+True Gaussians are defined in `research.synthetic_scenes` (see `PURITY`). Both boxes are computed alike, but the found
+objects are connected components, of which the largest counts.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ DAMAGES: dict[str, Damage] = {EXACT: Damage(noise=0.0), "hard": STEPS["hard"]}
 
 
 def asked(world: World, words: Words, damage: Damage, seed: int = 0) -> Answer:
-    """The answer of a lift with default options; every class is asked, and a Gaussian belongs to the best."""
+    """Return the answer of a lift with default options to all classes. A Gaussian belongs to the best class."""
     observed = observe(world, words, damage, seed)
     table = consensus(
         observed.evidence, observed.features, level=torch.zeros(len(observed.features), dtype=torch.int64)
@@ -45,7 +45,7 @@ def asked(world: World, words: Words, damage: Damage, seed: int = 0) -> Answer:
 
 
 def box_scores(means: Tensor, truth: Tensor, found: Answer) -> list[float]:
-    """IoU of the box of every class: of its true Gaussians, and of the largest connected part that is found."""
+    """Return, for each class, the IoU of the box of its true Gaussians and the box of the largest component found."""
     instances = answer_instances(found)
     scores = []
     for c in range(len(found.texts)):
@@ -59,7 +59,7 @@ def box_scores(means: Tensor, truth: Tensor, found: Answer) -> list[float]:
 
 
 def table(rows: Mapping[str, Sequence[float]], names: Sequence[str]) -> str:
-    """As markdown."""
+    """Return the scores as a Markdown table."""
     lines = [f"| object | {' | '.join(rows)} |", "|---" * (1 + len(rows)) + "|"]
     for i, name in enumerate(names):
         lines.append(f"| {name} | {' | '.join(f'{scores[i]:.2f}' for scores in rows.values())} |")
@@ -72,7 +72,7 @@ def main() -> None:
     from tests.captures import SHARED  # noqa: PLC0415
 
     parser = argparse.ArgumentParser()
-    parser.add_argument("--views", type=int, help="of an even spread; by default all 44")
+    parser.add_argument("--views", type=int, help="number of evenly spread views; all 44 by default")
     world, words = tabletop(parser.parse_args().views), real_words()
     names = read_names(SHARED / "captures" / "tabletop" / "labels.json").classes
     rows = {step: box_scores(world.scene.means, world.truth, asked(world, words, d)) for step, d in DAMAGES.items()}

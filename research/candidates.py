@@ -1,4 +1,4 @@
-"""What the grid compares: every variant with its parameters, in one table, the simplest first."""
+"""Candidates of the grid: every variant of the refinement with its parameters, the simplest first."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ class Candidate:
 
     vote: Vote = "none"
     consensus: float | None = None
-    """Its power; None: the features as they are."""
+    """Power of the consensus, or None for no consensus."""
     sigma_d: float = 1.0
     tau: float = 0.95
     gamma: float = 0.4
     delta: float = 0.0
     prior: float = 4.0
-    """Of the posterior vote, in views."""
+    """Prior of the posterior vote, in views."""
 
     @property
     def name(self) -> str:
-        """The method, and every parameter in which it differs from the method's first entry in the table."""
+        """The method, and each parameter in which it differs from the first entry of the method in the table."""
         method = f"consensus_{self.vote}" if self.consensus is not None else self.vote
         method = "consensus" if method == "consensus_none" else method
         first = FIRST[self.vote]
@@ -35,7 +35,7 @@ class Candidate:
 
 
 POWER, POWERS = 1.0, (1.0, 2.0, 3.0)
-"""Of the consensus: the default of `core.consensus`, and all that are tried."""
+"""Default power of the consensus in `core.consensus`, and all powers to try."""
 FIRST: dict[Vote, Candidate] = {
     "none": Candidate(),
     "linear": Candidate("linear"),
@@ -45,7 +45,7 @@ FIRST: dict[Vote, Candidate] = {
     "paper": Candidate("paper"),
     "posterior": Candidate("posterior", sigma_d=2.0),
 }
-"""Version 0.1's fitted parameters, but of the posterior vote."""
+"""First entry of each vote: version 0.1's fitted parameters, except for the posterior vote."""
 PRIORS = (4.0, 2.0, 8.0)
 CANDIDATES: tuple[Candidate, ...] = (
     *(FIRST[vote] for vote in ("none", "linear", "plain_knn", "norm_only", "support_only", "paper")),

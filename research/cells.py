@@ -1,4 +1,4 @@
-"""What all cells of one scene and one kind of region share: evidence, neighbours, voters, words and looks."""
+"""Data that all cells of one scene and one kind of region share: evidence, neighbors, voters, words and histograms."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ from research.third_room import third
 
 NEIGHBORS = 36
 SAMPLE = 50
-"""Gaussians of every region that the consensus looks at."""
+"""Number of Gaussians per region that the consensus samples."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How large everything is."""
+    """Sizes of scenes, samples and regions."""
 
     voters: int | None = None
-    """Gaussians that vote and count; None: all whose class is known."""
+    """Number of Gaussians that vote and count, or None for all with a known class."""
     gaussians: int | None = None
-    """Of the rooms; None: as many as they have by default."""
+    """Number of Gaussians of the rooms, or None for their default."""
     views: int | None = None
-    """Of the tabletop; None: all."""
+    """Number of training views of the tabletop, or None for all."""
     room_views: int | None = None
     room_width: int | None = None
-    """Views of the rooms, and pixels across; None: as many as they have by default."""
+    """Views of the rooms, and width of these views in pixels, or None for their defaults."""
     pieces: int | None = None
-    """Per image; None: as many as the source makes by default."""
+    """Number of pieces per image, or None for the default of the source."""
     device: str = "cpu"
 
 
 @dataclass(frozen=True)
 class Place:
-    """What a site is built for."""
+    """Scene, kind of region and floaters of a site."""
 
     scene: str
     kind: str
@@ -55,12 +55,12 @@ class Place:
 
     @staticmethod
     def of(cell: Cell) -> Place:
-        """Where a cell is run."""
+        """Return the place of a cell."""
         return Place(cell.scene, cell.kind, cell.damage == "floaters")
 
 
 class Site:
-    """Runs the cells of one place."""
+    """Runner of the cells of one place."""
 
     def __init__(self, place: Place, settings: Settings) -> None:
         base = base_world(place.scene, settings)
@@ -90,7 +90,7 @@ class Site:
         return world_looks(self._whole) if self.cut is None else self._looks
 
     def observed(self, cell: Cell, seed: int) -> Observed:
-        """What a lift gets in a cell."""
+        """Return the input of a lift in a cell."""
         if cell.statistic == "histogram":
             words, lengths = self.looks, None
         elif cell.statistic == REAL:
@@ -102,7 +102,7 @@ class Site:
         return observe_pieces(self.cut, words, damage_of(cell), seed, lengths)
 
     def run(self, cell: Cell, seed: int, candidates: Sequence[Candidate]) -> dict[str, Result]:
-        """All candidates on one observation, in their order."""
+        """Return the results of all candidates on one observation, in their order."""
         observed = self.observed(cell, seed)
         classes = (self.looks if cell.statistic == "histogram" else self.words[cell.statistic]).classes
         by_table: dict[float | None, list[Candidate]] = {}
@@ -118,7 +118,7 @@ class Site:
 
 
 def agreed_tables(evidence: Evidence, features: Tensor, powers: Sequence[float]) -> dict[float, Tensor]:
-    """F' of every power; the overlaps of regions are computed once."""
+    """Return the features after the consensus for each power. The overlaps of regions are computed once."""
     if len(powers) == 0:
         return {}
     chosen, chance = sample_gaussians(evidence.rows, evidence.num_regions, SAMPLE)
@@ -129,7 +129,7 @@ def agreed_tables(evidence: Evidence, features: Tensor, powers: Sequence[float])
 
 @lru_cache(maxsize=1)
 def base_world(scene: str, settings: Settings) -> World:
-    """A scene, on the CPU."""
+    """Return a scene on the CPU."""
     if scene == "tabletop":
         return tabletop(settings.views)
     given = {"num_gaussians": settings.gaussians, "views": settings.room_views, "width": settings.room_width}
@@ -138,14 +138,15 @@ def base_world(scene: str, settings: Settings) -> World:
 
 
 def words_of(scene: str, classes: int) -> dict[str, Words]:
-    """Vectors of the classes by statistic: CLIP's for the tabletop, made ones as close to each other for the rooms."""
+    """Return the class vectors by statistic: CLIP's for the tabletop, and made vectors with similar cosines for the
+    rooms."""
     close = real_words() if scene == "tabletop" else made_words(classes)
     apart = orthogonal_words(classes)
     return {name: apart if name in ("orthogonal", REAL) else close for name in (*LENGTHS, REAL)}
 
 
 def sample_of(truth: Tensor, settings: Settings) -> Tensor | None:
-    """The Gaussians that vote, in order; None: all whose class is known."""
+    """Return the Gaussians that vote, in ascending order, or None for all with a known class."""
     if settings.voters is None:
         return None
     known = (truth >= 0).nonzero().squeeze(1)
@@ -154,13 +155,13 @@ def sample_of(truth: Tensor, settings: Settings) -> Tensor | None:
 
 
 def renumbered(voters: Voters, kept: Tensor) -> Voters:
-    """The voters of a scene of which only some Gaussians are kept."""
+    """Return the voters of a scene that has only the Gaussians `kept`."""
     group = torch.searchsorted(kept, voters.group.clamp(min=0))
     return replace(voters, group=torch.where(voters.group >= 0, group, -1))
 
 
 def restricted(evidence: Evidence, kept: Tensor | None) -> Evidence:
-    """The evidence of some Gaussians; None: of all."""
+    """Return the evidence of the Gaussians `kept`, or of all Gaussians for None."""
     if kept is None:
         return evidence
     rows, unlabeled = (x.select_rows(kept.cpu()) for x in (evidence.rows, evidence.unlabeled))
@@ -168,7 +169,7 @@ def restricted(evidence: Evidence, kept: Tensor | None) -> Evidence:
 
 
 def ready(world: World, evidence: Evidence, device: str) -> World:
-    """The world with other evidence, for observations on a device."""
+    """Return the world on a device with other evidence, for observations."""
     kept = {key: getattr(world, key) for key in ("azimuth_rank", "angles", "parts")}
     moved = replace(world, evidence=evidence).to(device)
     moved.__dict__.update(kept)

@@ -1,13 +1,13 @@
-"""Many clients of ns-normlift-view at once: errors, latencies and memory.
+"""Many simultaneous clients of ns-normlift-view: errors, latencies and memory.
 
     python -m research.clients               lifts the fox capture first
     python -m research.clients --load-config outputs/room/normlift/demo/config.yml
     taskset -c 0,1 python -m research.clients --clients-on 2 3
 
-64 clients ask one question every 2 s over HTTP for 60 s. Half of the questions are prompts that have been asked before,
-half are new. Every answer has the relevancies and the mask of all Gaussians. The clients run in one process on the
-cores of the server, or on those of `--clients-on`. Shares are of the processor time of the server's cores. Prompts are
-names of colors, for the encoder color.
+64 clients send one query every 2 s over HTTP for 60 s. Half of the prompts have been sent before, half are new. Each
+response contains the relevancies and the mask of all Gaussians. The clients run in one process on the cores of the
+server, or on those of `--clients-on`. Shares refer to the processor time of the server's cores. Prompts are names of
+colors, for the encoder color.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CLIENTS, PERIOD, SECONDS, SETTLED = 64, 2.0, 60.0, 10.0
 
 @dataclass
 class Log:
-    """What the clients have seen."""
+    """Measurements of the clients."""
 
     seconds: list[float] = field(default_factory=list)
     errors: list[str] = field(default_factory=list)
@@ -45,7 +45,7 @@ class Log:
 
 
 async def ask(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, path: str, prompt: str) -> tuple[int, int]:
-    """Send one question over an open connection; its status and the number of bytes of the answer."""
+    """Send one query over an open connection, and return the status and the number of bytes of the response."""
     body = json.dumps({"texts": [prompt], "arrays": "safetensors"}).encode()
     writer.write(f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body)
     head = (await reader.readuntil(b"\r\n\r\n")).decode().lower()
@@ -55,7 +55,7 @@ async def ask(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, path: 
 
 
 async def client(port: int, path: str, prompts: Iterator[str], log: Log, delay: float) -> None:
-    """Ask one question every `PERIOD` seconds, the first after a delay."""
+    """Send one query every `PERIOD` seconds, the first after a delay."""
     start = time.perf_counter() + delay
     reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=2**20)
     for number in range(int(SECONDS / PERIOD)):
@@ -75,7 +75,7 @@ async def client(port: int, path: str, prompts: Iterator[str], log: Log, delay: 
 
 
 def questions() -> Iterator[str]:
-    """In turns a known prompt and a new one, which names two colors."""
+    """Yield a known prompt and a new one in turn. A new prompt names two colors."""
     names, choice = [*json.loads(XKCD.read_text())], random.Random(0)
     for known in cycle(COLOURS):
         yield known
@@ -83,7 +83,7 @@ def questions() -> Iterator[str]:
 
 
 async def ask_all(server: ViewServer, run: str, log: Log) -> tuple[int, int]:
-    """Let all clients ask; bytes of memory that the server holds after `SETTLED` seconds, and at the end."""
+    """Run all clients, and return the memory of the server in bytes after `SETTLED` seconds and at the end."""
     prompts, path = questions(), f"/api/runs/{run}/query"
     delays = [PERIOD * number / CLIENTS for number in range(CLIENTS)]
     tasks = [asyncio.create_task(client(server.port, path, prompts, log, delay)) for delay in delays]
@@ -94,7 +94,7 @@ async def ask_all(server: ViewServer, run: str, log: Log) -> tuple[int, int]:
 
 
 def add_clients(report: Report, config: Path, clients_on: Sequence[int] = ()) -> None:
-    """Adds the metrics of a lifted run, with the encoder color."""
+    """Add the metrics of a lifted run, with the encoder color."""
     log, cores = Log(), len(os.sched_getaffinity(0))
     with served(config) as server:
         if len(clients_on) > 0:

@@ -1,20 +1,20 @@
-"""What a person waits for: whole commands in processes of their own, from a cold shell.
+"""Times of whole commands, each in a process of its own.
 
-    python -m research.command             questions and help (5 runs each), on a machine with a GPU lifts
+    python -m research.command             queries and help (5 runs each); lifts on a machine with a GPU
     python -m research.command --quick     fewer runs
-    python -m research.command --config outputs/.../config.yml      a run of your own in place of the fox
-    python -m research.command --before ../before   what is waited for with colors, beside another checkout, in turns
+    python -m research.command --config outputs/.../config.yml      another trained run in place of the fox
+    python -m research.command --before ../before   times with colors, in turns with another checkout
 
-CLIP is ViT-B-16 with random weights, which take as long as trained ones. Lifts are of patches: a first one with empty
-caches of kernels and bytecode, first ones with those filled (median of 3; pip leaves packages with their bytecode), and
-ones with every stage cached (median of 3). The error of a new text is that of its vector against open_clip in float64.
-What the file holds of the other kind of machine stays.
+CLIP is ViT-B-16 with random weights, which take as long as trained ones. Lifts use patches: a first lift with empty
+caches of kernels and bytecode, first lifts with these caches filled (median of 3; pip installs bytecode), and lifts
+with every stage cached (median of 3). The error of a new text is that of its vector compared with open_clip in float64.
+Existing metrics of the other kind of machine are kept in the file.
 
-With --before: lifts by colors with empty caches of kernels and bytecode, with those filled (cache of features empty),
-with every stage cached, and, if numba is installed, on two cores without the GPU; --render-dir with one prompt and
-three views, and with five prompts and all views; a thousand names of colors, vectors given, in a warm process on the
-GPU, and on two cores; if their weights are here, edges with ImageNet's classifier. --quick measures the other checkout
-once, and leaves out its slowest cases.
+--before measures these cases with colors: lifts with empty caches of kernels and bytecode, with these caches filled but
+no cached features, with every stage cached, and, if numba is installed, on two cores without the GPU. It also measures
+--render-dir with one prompt and three views, and with five prompts and all views. A thousand color names with given
+vectors are queried in a warm process on the GPU and on two cores. If its weights are on this machine, it measures edges
+with ImageNet's classifier. --quick measures the other checkout once, and omits its slowest cases.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ FOX = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.y
 MODEL = "ViT-B-16"
 KERNELS = ("evidence", "neighbors", "vote")
 STAGES = ("features", *KERNELS, "lift", "store")
-"""Of the summary; what is not among them is overhead."""
+"""Stages in the summary of a lift. All other time is overhead."""
 WEIGHTS = """
 import sys, torch, open_clip
 from safetensors.torch import save_file
@@ -71,7 +71,7 @@ start.lift()
 
 
 def caches(folder: Path) -> dict[str, str]:
-    """Environment with the caches of kernels and bytecode in folder/kernels."""
+    """Return environment variables that place the caches of kernels and bytecode in folder/kernels."""
     return {
         "TRITON_CACHE_DIR": f"{folder}/kernels/triton",
         "NUMBA_CACHE_DIR": f"{folder}/kernels/numba",
@@ -121,7 +121,8 @@ FIVE = ("red", "green", "blue", "brown", "orange")
 def lifted(
     trained: Path, folder: Path, name: str, *flags: object, checkout: Path = HERE, program: str = LIFT
 ) -> dict[str, float]:
-    """Lifts into folder/NAME, kernels cached in folder/kernels; seconds of every stage, and `wall` of the process."""
+    """Lift into folder/NAME with kernels cached in folder/kernels; return the seconds of each stage and `wall` of the
+    process."""
     seconds = folder / "seconds.json"
     environment = {"SECONDS_FILE": str(seconds), **caches(folder)}
     given = ("--load-config", trained, "--output-dir", folder / name, *flags)
@@ -132,7 +133,8 @@ def lifted(
 
 
 def make_weights(folder: Path, texts: Sequence[str]) -> tuple[object, ...]:
-    """Weights of a CLIP model, and rows.pt with the vectors of some texts in float64; the flags that name the model."""
+    """Write weights of a CLIP model, and rows.pt with the vectors of some texts in float64; return the flags of the
+    model."""
     subprocess.run([sys.executable, "-W", "ignore", "-c", WEIGHTS, MODEL, str(folder), *texts], check=True)
     return ("--encoder-model", MODEL, "--encoder-pretrained", folder / "weights.safetensors")
 
@@ -190,7 +192,7 @@ def add_lifts(report: Report, trained: Path, folder: Path, repeats: int) -> None
 
 
 def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: bool) -> None:
-    """Add what a person waits for with colors, of this checkout and of another one, in turns."""
+    """Add the waiting times of a user with the encoder color, for this checkout and another one, in turns."""
     checkouts = {"now": HERE, "before": before}
     folders = {name: folder / name for name in checkouts}
     data = trained.parents[4] / trained.parents[2].name
@@ -262,7 +264,7 @@ def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: 
 
 
 def joined(report: Report, file: Path) -> Report:
-    """The report, every unit with its machine, and what a file of it holds besides."""
+    """Return the report with the machine in every unit, and with the other metrics of an existing file."""
     here = [replace(metric, unit=f"{metric.unit}; {hardware()}") for metric in report.metrics]
     before = [Metric(**row) for row in json.loads(file.read_text())["metrics"]] if file.is_file() else []
     keys = {metric.key for metric in here}
@@ -287,7 +289,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", type=Path, default=FOX, help="config.yml of a trained run; by default the fox")
     parser.add_argument("--quick", action="store_true", help="fewer runs")
-    parser.add_argument("--before", type=Path, help="another checkout, to compare what is waited for with colors")
+    parser.add_argument("--before", type=Path, help="another checkout, whose times with colors are compared")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     main(arguments.config, arguments.quick, arguments.before, arguments.output)

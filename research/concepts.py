@@ -1,4 +1,4 @@
-"""docs/evidence.png and docs/concepts.png: what every Gaussian knows, drawn in the plain room with masks damaged.
+"""docs/evidence.png and docs/concepts.png: evidence and numbers of Gaussians in the plain room with damaged masks.
 
 python -m research.concepts
 """
@@ -23,24 +23,24 @@ from research.synthetic_scenes import World, demo, made_words
 from tests.plain_room import plain_room
 
 STEP, SEED, VIEW = "hard", 0, 12
-"""The view is one of those lifted."""
+"""Damage step, seed, and index of the view, which is one of the lifted views."""
 THING = "red"
-"""Of which class the Gaussian is whose evidence is drawn."""
+"""Class of the Gaussian whose evidence is drawn."""
 LOW = 0.3
-"""The darkest colour of what is drawn from 0 to 1."""
+"""Value of the darkest color of maps from 0 to 1."""
 
 Panel = tuple[str, Tensor | np.ndarray, bool]
-"""Title, what is shown, and whether it is numbers."""
+"""Title, content, and True if the content is a map of numbers."""
 
 
 def drawn(world: World, values: Tensor) -> Tensor:
-    """[H, W] mean of the values of the Gaussians that a pixel of the view is made of."""
+    """Return [H, W], the mean value of the Gaussians that compose each pixel of the view."""
     shown, alpha = render(world.scene, world.cameras[VIEW], values[:, None])
     return shown[..., 0] / alpha.clamp(min=1e-6)
 
 
 def draw(name: str, panels: Sequence[Panel]) -> None:
-    """Panels beside each other, with one scale for those that are numbers, as docs/NAME."""
+    """Draw panels next to each other as docs/NAME, with one color scale for all maps of numbers."""
     rows = (len(panels) + 2) // 3
     figure = Figure(figsize=(12, 3.1 * rows), layout="constrained")
     places, scale = figure.subplots(rows, 3, squeeze=False), None
@@ -57,7 +57,7 @@ def draw(name: str, panels: Sequence[Panel]) -> None:
 
 
 def evidence_panels(world: World, observed: Observed, classes: Tensor, names: Sequence[str]) -> list[Panel]:
-    """The photographs that show most of one Gaussian of the ball, each with the region that it lies in."""
+    """Return the three images with the most weight of one Gaussian of the ball, each with its region highlighted."""
     rows = observed.evidence.rows
     totals = torch.segment_reduce(rows.weight.double(), "sum", offsets=rows.offsets)
     ball = world.truth == names.index(THING)
@@ -77,7 +77,7 @@ def evidence_panels(world: World, observed: Observed, classes: Tensor, names: Se
 
 
 def main() -> None:
-    """Draws both pictures."""
+    """Draw both figures."""
     torch.set_grad_enabled(False)
     world = demo()
     words = made_words(world.classes)

@@ -1,14 +1,15 @@
-"""Which R says of a consensus's answers how good they are, and which one a vote should use: that of F or that of F'.
+"""Comparison of two reliabilities for the answers of the consensus and for the vote: R of F and R of F'.
 
     python -m research.consensus                 tabletop (half of its views), plain room and second room
-    python -m research.consensus --minutes 9     no new observation after so many minutes; the same command goes on
+    python -m research.consensus --minutes 9     start no observation after this many minutes; repeat to continue
     python -m research.consensus --quick         plain room of 20,000 Gaussians, two steps, one seed
 
-Writes results/consensus.json. Damage and seeds are those on which no parameter was fitted (`fit.HELD_OUT`, seeds from
-200 on), and the two of the ladder whose mistakes are not independent. Of every observation: Kendall's tau of R and of
-whether the unrefined answer of F' is right, over all Gaussians whose class is known; Spearman's of ten bins of equal
-count by R and the accuracy in each, where that varies; and mIoU after the posterior vote with either R, of a sample.
-The R with the higher mean of both over scenes is the one to store. Accuracy of all methods: `research.accuracy`.
+The command writes results/consensus.json. No parameter was fitted on its damage steps and seeds (`fit.HELD_OUT`, seeds
+from 200 on, and the two steps of the ladder with dependent mistakes). Three figures are computed for each observation.
+Kendall's tau compares R with the correctness of the unrefined answers of F', over all Gaussians with a known class.
+Spearman's correlation compares ten bins of equal count by R with their accuracy, if the accuracy varies. The mIoU after
+the posterior vote with each R is that of a sample. The R to store is the one with the higher mean of tau and of mIoU
+over scenes. `research.accuracy` has the accuracy of all methods.
 """
 
 from __future__ import annotations
@@ -42,14 +43,14 @@ SCENES = ("tabletop", "demo", "second")
 DAMAGES = (*HELD_OUT, "group", "arc")
 FIRST_SEED = 200
 VIEWS = 22
-"""Training views of the tabletop."""
+"""Number of training views of the tabletop."""
 VARYING = 0.05
-"""Bins between which accuracy differs by less rank nothing."""
+"""Bins are not ranked if their accuracies differ by less than this."""
 SOURCES = ("F", "F'")
 
 
 def make_world(name: str, gaussians: int) -> tuple[World, Words]:
-    """A scene and the vectors of its classes."""
+    """Return a scene and the vectors of its classes."""
     if name == "tabletop":
         return tabletop(VIEWS), real_words()
     world = demo(gaussians) if name == "demo" else second(gaussians)
@@ -59,7 +60,7 @@ def make_world(name: str, gaussians: int) -> tuple[World, Words]:
 def observation(
     world: World, classes: Tensor, words: Words, voting: Neighbors, some: Tensor, step: str, seed: int
 ) -> dict[str, Any]:
-    """One row."""
+    """Return the row of one observation."""
     observed, means = observe(world, words, STEPS[step], seed), world.scene.means
     found = consensus(observed.evidence, observed.features)
     lifts = {name: lift(observed.evidence, x) for name, x in zip(SOURCES, (observed.features, found.features))}
@@ -80,7 +81,7 @@ def observation(
 
 
 def run_all(arguments: argparse.Namespace, steps: Sequence[str], deadline: float) -> list[dict[str, Any]]:
-    """One row per scene, step and seed, until the deadline (`time.time`)."""
+    """Return one row per scene, step and seed, and stop at the deadline (`time.time`)."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     run = {"voters": arguments.voters, "gaussians": arguments.gaussians, "views": VIEWS}
     rows = read_rows(arguments.rows, run)
@@ -108,14 +109,14 @@ def run_all(arguments: argparse.Namespace, steps: Sequence[str], deadline: float
 
 
 def ranks(row: dict[str, Any], source: str) -> float | None:
-    """Spearman's correlation of ten bins, None where accuracy hardly varies by either R."""
+    """Return Spearman's correlation of ten bins, or None if the accuracy hardly varies by either R."""
     if max(np.ptp(row[x]["bins"]) for x in SOURCES) < VARYING:
         return None
     return spearman_test(torch.arange(10.0), torch.tensor(row[source]["bins"])).value
 
 
 def summarize(rows: list[dict[str, Any]], report: Report) -> None:
-    """Means with intervals over observations: of all scenes, of each, and of each step."""
+    """Add means with intervals over observations: of all scenes, of each scene, and of each step."""
     scenes, steps = (list(dict.fromkeys(row[key] for row in rows)) for key in ("scene", "step"))
     groups = {"all": rows}
     groups |= {scene: [row for row in rows if row["scene"] == scene] for scene in scenes}
@@ -159,7 +160,7 @@ def main(arguments: argparse.Namespace) -> None:
 
 
 def wanted_rows(arguments: argparse.Namespace, steps: Sequence[str]) -> Iterator[tuple[str, str, int]]:
-    """Scene, step and seed of every observation."""
+    """Yield scene, step and seed of every observation."""
     for scene in arguments.scenes:
         for step in steps:
             yield from ((scene, step, FIRST_SEED + seed) for seed in range(arguments.seeds))
@@ -169,10 +170,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a small scene, two steps, one seed")
     parser.add_argument("--voters", type=int, default=2500, help="Gaussians that vote and count for mIoU")
-    parser.add_argument("--gaussians", type=int, default=40_000, help="of each room")
+    parser.add_argument("--gaussians", type=int, default=40_000, help="Gaussians of each room")
     parser.add_argument("--seeds", type=int, default=2, help="repeats")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
-    parser.add_argument("--minutes", type=float, help="no observation begins later than this")
+    parser.add_argument("--minutes", type=float, help="minutes after which no observation starts")
     parser.add_argument("--rows", type=Path, default=RESULTS / "consensus_rows.jsonl", help="finished observations")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     main(parser.parse_args())

@@ -1,16 +1,16 @@
-"""Whether the study of coverage suggests photographs that help: its choices against random ones.
+"""Comparison of the images that the coverage study suggests with random images.
 
-    python -m research.coverage                     plain room and, where the captures are, the tabletop
+    python -m research.coverage                     plain room and, if the captures are available, the tabletop
     python -m research.coverage --scenes demo --steps "noise only"
 
-Of the training views, eight neighbours are lifted, as if a capture had begun. Four more are added: those that the study
-suggests from weights alone, or four drawn at random, 64 times. The score is mIoU of the lift of all twelve, before the
-vote, over all Gaussians whose class is known; the rank of the suggestions is the share of draws that they exceed, ties
-counting half. The study must reach the 75th percentile on average over seeds at the step "noise only"; steps with
-damaged masks are reported. Writes results/coverage.json.
+Eight neighboring training views are lifted, as at the start of a capture. Four views are then added: the views that the
+study suggests from weights alone, or four random views, in 64 draws. The score is the mIoU of the lift of all twelve,
+before the vote, over all Gaussians with a known class. The rank of the suggestions is the share of draws that they
+exceed; ties count half. At the step "noise only", the study must reach the 75th percentile on average over seeds. Steps
+with damaged masks are only reported. The command writes results/coverage.json.
 
-The rule was fixed before any number was looked at: the gain of `evaluation.coverage`. Other rules were compared on
-20 other seeds (100 to 119) of a room of 20,000 Gaussians: see docs/evaluation.md.
+The rule, the gain of `evaluation.coverage`, was fixed before any result was seen. Other rules were compared on 20 other
+seeds (100 to 119) of a room of 20,000 Gaussians; see docs/evaluation.md.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from research.synthetic_scenes import Words, World
 
 START, ADDED, DRAWS = 8, 4, 64
 GOAL = 75.0
-"""Percentile of the draws that suggestions must reach on average."""
+"""Percentile of the draws that the suggestions must reach on average."""
 STEPS = ("noise only", "mild", "merged masks", "wrong classes", "hard")
 
 
 class Outcome(NamedTuple):
-    """One seed."""
+    """Scores of one seed, in percentage points of mIoU."""
 
     before: float
     """mIoU of the first views."""
@@ -52,14 +52,16 @@ class Outcome(NamedTuple):
 
     @property
     def percentile(self) -> float:
-        """Share of the draws that the suggestions exceed, in per cent; ties count half."""
+        """Share of the draws that the suggestions exceed, in percent; ties count half."""
         drawn = np.array(self.draws)
         return float(100 * ((drawn < self.suggested).mean() + 0.5 * (drawn == self.suggested).mean()))
 
 
 class Sums:
-    """sum_s E_js (F_s t) of every view apart: what any choice of views answers is a sum over views. The length of f_j,
-    which the cosines are divided by, changes no arg-max.
+    """Sums sum_s E_js (F_s t) for each view.
+
+    The answer for any set of views is a sum over these views. The division by the length of f_j does not change the arg
+    max.
     """
 
     def __init__(self, world: World, words: Words, observed: Observed, counted: Tensor) -> None:
@@ -73,14 +75,14 @@ class Sums:
         self.truth, self.classes = world.truth[counted], world.classes
 
     def miou(self, views: Sequence[int]) -> float:
-        """Of the lift of some views, in points."""
+        """Return the mIoU of the lift of some views, in percentage points."""
         found = self.sums[:, list(views)].sum(1)
         answer = classify(found, (found != 0).any(1))
         return 100 * class_scores(confusion(self.truth, answer, self.classes)).miou
 
 
 def suggested(observed: Observed, weights: SparseRows, first: Sequence[int], left: Sequence[int]) -> list[int]:
-    """What the study adds to the first views."""
+    """Return the views that the study adds to the first views."""
     columns = observed.evidence.columns_of(first)
     lifted = lift(observed.evidence.select_views(first), observed.features[columns])
     chosen, rest = (
@@ -92,7 +94,7 @@ def suggested(observed: Observed, weights: SparseRows, first: Sequence[int], lef
 
 
 def outcome(world: World, words: Words, weights: SparseRows, counted: Tensor, step: str, seed: int) -> Outcome:
-    """The first views start anywhere; they and the draws depend on the seed alone, not on the step."""
+    """Return the scores of one seed. The first views and the draws depend only on the seed, not on the step."""
     observed = observe(world, words, LADDER[step], seed)
     g, count = torch.Generator().manual_seed(seed), len(world.cameras)
     start = int(torch.randint(0, count, (), generator=g))
@@ -111,7 +113,7 @@ def outcome(world: World, words: Words, weights: SparseRows, counted: Tensor, st
 def outcomes(
     world: World, words: Words, weights: SparseRows, step: str, seeds: Sequence[int], sample: int | None
 ) -> Iterator[Outcome]:
-    """One per seed, over a sample of the Gaussians whose class is known."""
+    """Yield the outcome of each seed, over a sample of the Gaussians with a known class."""
     known = (world.truth >= 0).nonzero().squeeze(1)
     some = torch.randperm(len(known), generator=torch.Generator().manual_seed(0))[:sample].to(known.device)
     for seed in seeds:
@@ -119,7 +121,7 @@ def outcomes(
 
 
 def add(report: Report, key: str, found: Sequence[Outcome]) -> None:
-    """Means over seeds, with intervals."""
+    """Add means over seeds, with intervals."""
     for name, unit, values in (
         ("before", "points", [one.before for one in found]),
         ("suggested", "points", [one.suggested for one in found]),
@@ -155,9 +157,9 @@ def main(arguments: argparse.Namespace) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=["tabletop", "demo"], help="tabletop, demo")
-    parser.add_argument("--steps", nargs="+", default=STEPS, choices=LADDER, help="of the ladder of damage")
+    parser.add_argument("--steps", nargs="+", default=STEPS, choices=LADDER, help="steps of the ladder of damage")
     parser.add_argument("--sample", type=int, help="Gaussians that count; all by default")
     parser.add_argument("--seeds", type=int, default=SEEDS, help="repeats")
-    parser.add_argument("--first-seed", type=int, default=0, help="100 and more are for development")
+    parser.add_argument("--first-seed", type=int, default=0, help="first seed; 100 and more are for development")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     main(parser.parse_args())

@@ -1,7 +1,7 @@
-"""The core on the fox capture on the CPU: evidence, lift, neighbours and vote; time, memory, error against float64.
+"""Time, memory and error of the core on the fox capture on the CPU: evidence, lift, neighbors and vote.
 
-python -m research.cpu            all 45 views at full resolution
-python -m research.cpu --quick    every fourth Gaussian, 4 views
+python -m research.cpu            all 45 views at full resolution python -m research.cpu --quick    every fourth
+Gaussian, 4 views
 """
 
 from __future__ import annotations
@@ -38,13 +38,12 @@ from research.gpu_cases import grid_labels
 from research.report import RESULTS, Report, stopwatch
 from tests.captures import SHARED, trained_scene, training_cameras
 
-"""Side of the square regions in pixels: 9 x 16 = 144 regions per view."""
 OTHER = 1e-3
-"""Length of the difference above which a refined direction is another one."""
+"""Length of the difference above which a refined direction counts as different."""
 
 
 def clip_like_table(rows: int) -> torch.Tensor:
-    """[rows, 512] unit rows: CLIP text vectors of random names, disturbed by noise of length 0.5."""
+    """Return [rows, 512] unit rows: CLIP text vectors of random names with noise of length 0.5."""
     g = torch.Generator().manual_seed(0)
     names = torch.from_numpy(np.load(SHARED / "clip_vectors" / "lvis_v1_text.npy").astype(np.float32))
     table = torch.nn.functional.normalize(names, dim=1)[torch.randint(0, len(names), (rows,), generator=g)]
@@ -52,7 +51,7 @@ def clip_like_table(rows: int) -> torch.Tensor:
 
 
 def relative_difference(a, b) -> float:
-    """Frobenius norm of the difference of two sparse matrices over that of the second."""
+    """Return the Frobenius norm of the difference of two sparse matrices, relative to the norm of the second."""
     joined = [
         torch.cat(pair)
         for pair in ((a.row_index(), b.row_index()), (a.column, b.column), (a.weight.double(), -b.weight))
@@ -74,7 +73,7 @@ for kernel, signature in numba.kernel_signatures(torch.float32):
 
 
 def warming() -> dict[str, float]:
-    """CPU seconds of a new process to import numba, and to load each kernel from the cache."""
+    """Return the CPU seconds that a new process takes to import numba and to load each kernel from the cache."""
     _, child = (  # the first one compiles what no cache holds
         subprocess.run([sys.executable, "-c", WARM], capture_output=True, text=True, check=True) for _ in range(2)
     )
@@ -86,7 +85,8 @@ def warming() -> dict[str, float]:
 
 
 def stages(scene: GaussianScene, camera: Camera, labels: torch.Tensor) -> tuple[dict[str, float], float]:
-    """CPU milliseconds of each stage of one view, and the share of the pairs of `assign_tiles` that is kept."""
+    """Return the CPU milliseconds of each stage of one view, and the share of the pairs of `assign_tiles` that are
+    kept."""
     job = RasterJob(scene, False, RasterSettings(), torch.float32)
     batch = RasterBatch([camera], [labels], [int(labels.max()) + 1])
     projected = job.project(camera)

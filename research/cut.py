@@ -1,17 +1,17 @@
-"""Average precision, and IoU at the default cut against IoU at the best one, on captures with labels drawn by hand.
+"""Average precision, and IoU at the default threshold compared with the best threshold, on captures with labels.
 
     python -m research.cut fox=RUN/config.yml castle=RUN/config.yml tabletop=RUN/config.yml     results/cut.json
 
-The labels are `fox_labels.json` next to the captures, `labels/castle_labels.json`, and the exact masks of six images
-of the tabletop. The vector of a label is its prototype, the normalized mean of the features of the regions inside its
-polygons, weighted by area, which is compared like a click. If the encoder knows the word, the word is a prompt too.
-Relevancies are rendered into the labeled images and compared with the polygons. Every prompt has one figure, pooled
-over its images.
+The labels are `fox_labels.json` next to the captures, `labels/castle_labels.json`, and the exact masks of six images of
+the tabletop. The vector of a label is its prototype: the normalized mean of the features of the regions inside its
+polygons, weighted by area. It is used like a click. If the encoder knows the word of a label, the word is also a
+prompt. Relevancies are rendered into the labeled images and compared with the polygons. The figures of a prompt pool
+its images.
 
 Keys: <capture>.<label>.ap; .images, the average precision in the images alone, by the cosines of regions; .best and
-.default, the IoU at the best threshold of that text and at the default one; for prototypes also other candidates.
-<capture>.mean.<cut>, the mean over texts of IoU divided by the best; <capture>.worst.<cut>, the smallest of these;
-<capture>.total.<cut>, the mean IoU over texts divided by the mean of the best.
+.default, the IoU at the best threshold of the prompt and at the default one; for prototypes also other candidates.
+<capture>.mean.<cut>, the mean over prompts of IoU divided by the best; <capture>.worst.<cut>, the smallest of these;
+<capture>.total.<cut>, the mean IoU over prompts divided by the mean of the best.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def label_masks(capture: str) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
 def region_rows(
     source: FeatureSource, views: dict[str, Any], images: Iterable[str]
 ) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-    """Return the features of every labeled image, and the row of each pixel among them, -1 without one."""
+    """Return the features of every labeled image, and the row of each pixel among them, or -1 without a region."""
     rows = {}
     for image in images:
         found = source.view(views[image].image, views[image].name)
@@ -121,22 +121,22 @@ def candidate_cuts(values: np.ndarray) -> dict[str, float]:
 
 
 class Asked(NamedTuple):
-    """A text that was asked in one capture, with the pixels of the images that show its label."""
+    """Answer to a prompt in one capture, with the pixels of the images that show its label."""
 
     answer: Any
     values: np.ndarray
     """Rendered relevancy of every pixel."""
     truth: np.ndarray
     in_images: np.ndarray
-    """Cosine of every pixel's region, -1 without one."""
+    """Cosine of the region of every pixel, or -1 without a region."""
 
 
 def ask(capture: str, config: Path, rule: RelevancyRule = "cosine", *, step: int = 1) -> dict[str, Asked]:
-    """Ask the prototype of every label of a lifted capture, and its word if the encoder knows it.
+    """Query the prototype of every label of a lifted capture, and its word if the encoder knows it.
 
     Args:
-        rule: rule of the prototypes.
-        step: keep every step-th pixel, and leave out the words if it is above 1.
+        rule: Relevancy rule of the prototypes.
+        step: Keep every step-th pixel. If it is above 1, words are omitted.
     """
     run, masks = nl.open_run(config), dict(label_masks(capture))
     scene, field = run.scene, run.field

@@ -1,8 +1,7 @@
-"""A ladder of damage to masks and their features, with the observation that a lift gets; pure functions with a seed.
+"""A ladder of damage to masks and their features, and the resulting input of a lift; pure functions with a seed.
 
-What features are made of stands in `research.features`. `LADDER` is version 0.1's 13 steps, whose numbers do not
-change: what later steps draw comes from a generator of their own. `STEPS` adds two whose mistakes are not independent
-from mask to mask.
+`research.features` describes the features. `LADDER` has version 0.1's 13 steps, whose results do not change, because
+later steps use a separate random generator. `STEPS` adds two steps whose mistakes are not independent between masks.
 """
 
 from __future__ import annotations
@@ -20,43 +19,45 @@ from research.real_features import Cosines, Regions, real_features
 from research.synthetic_scenes import PARTS, Cells, Words, World, block_side
 
 LATER = 2**20
-"""Added to the seed of what the steps after version 0.1's draw, so that the others keep their numbers."""
+"""Number added to the seed of the random numbers of later steps, so that the results of the others do not change."""
 GROUP = (3, 6)
-"""Fewest and most things that share one mask in a view of damage `grouped`."""
+"""Smallest and largest number of objects that share one mask in a view of damage `grouped`."""
 
 
 @dataclass(frozen=True)
 class Damage:
-    """How much goes wrong; the default is the first step of the ladder, features with noise and nothing else."""
+    """Amounts of damage. The default is the first step of the ladder, features with noise and no other damage."""
 
     noise: float = 1.2
     """Length of the noise of every mask in every view; a text vector has length 1."""
     wrong: float = 0.0
-    """Share of masks whose feature is that of another class, near ones more often."""
+    """Share of masks with the feature of another class; similar classes are more likely."""
     merged: float = 0.0
-    """Share of masks that are one with another mask of their view; the larger gives the class."""
+    """Share of masks that are merged with another mask of their view. The larger mask determines the class."""
     split: float = 0.0
-    """Share of masks cut in two through their middle; each half has its own noise and its own mistakes."""
+    """Share of masks that are cut in two through their middle. Each half has its own noise and its own mistakes."""
     dropped: float = 0.0
-    """Share of masks that are missing: unlabelled pixels."""
+    """Share of masks that are missing; their pixels are unlabeled."""
     shifted: float = 0.0
-    """Blocks (a fortieth of the image's width) by which every mask is off, in a direction of its own; of overlapping
-    masks the later wins."""
+    """Shift of each mask in a random direction, in blocks (fortieths of the image width). Later masks cover earlier
+    ones."""
     boundary: float = 0.0
-    """Share of cells that take the label found two blocks away in a random direction: frayed edges."""
+    """Share of cells with the label found two blocks away in a random direction, which frays edges."""
     pose: float = 0.0
-    """Blocks by which all masks of a view are off together: what a rotation error of the pose does, to first order."""
+    """Common shift of all masks of a view, in blocks. To first order, this is the effect of a rotation error of the
+    pose."""
     views: int | None = None
-    """Use so many views, spread evenly from a random start; None: all."""
+    """Number of views to use, spread evenly from a random start, or None for all."""
     dominant: float = 1.0
-    """Factor on the weight of one random view of every five, as if their images had so many times the pixels."""
+    """Factor on the weight of one random view in five, as if these images had so many times the pixels."""
     floaters: bool = False
-    """The scene has 5 % more Gaussians floating before the cameras; see `synthetic_scenes.with_floaters`."""
+    """True if the scene has 5 % more Gaussians that float in front of the cameras; see
+    `synthetic_scenes.with_floaters`."""
     grouped: float = 0.0
-    """Share of the views in which 3 to 6 of the things in sight, those whose masks are nearest to a random one of them,
-    share one mask; the largest gives the class."""
+    """Share of the views in which 3 to 6 visible objects share one mask. These are the objects whose masks are nearest
+    to that of a random one of them. The largest mask determines the class."""
     arc: float = 0.0
-    """Every object has one wrong class, the same over this share of all views: neighbours by azimuth around it."""
+    """Share of all views, neighbors by azimuth around an object, in which the object has the same wrong class."""
 
 
 MILD = Damage(wrong=0.1, merged=0.1, dropped=0.1, boundary=0.15)
@@ -75,29 +76,29 @@ LADDER = {
     "floaters": replace(MILD, floaters=True),
     "hard": Damage(2.0, wrong=0.3, merged=0.2, dropped=0.25, boundary=0.35, shifted=0.4),
 }
-"""Version 0.1's."""
+"""Steps of version 0.1."""
 STEPS = LADDER | {"group": replace(MILD, grouped=0.4), "arc": replace(MILD, arc=0.4)}
 
 
 class Observed(NamedTuple):
-    """What a lift gets."""
+    """Input of a lift."""
 
     evidence: Evidence
     features: Tensor
-    """[S, D] unit."""
+    """[S, D] unit rows."""
     columns: Tensor
-    """[1, C'] region of every cell of the chosen views, -1 for none."""
+    """[1, C'] region of every cell of the chosen views, or -1 for none."""
     views: list[int]
 
 
 def observe(
     world: World, words: Words | Looks, damage: Damage, seed: int, lengths: Lengths | Cosines | None = None
 ) -> Observed:
-    """Masks and features of the world after the damage. The same arguments give the same result on any device.
+    """Return masks and features of the world after the damage. The same arguments give the same result on any device.
 
     Args:
-        words: what features are made of; with `Looks` they are histograms of what the damaged masks show.
-        lengths: of the parts of features that are made of words, or what they measure, in regions of parts of things.
+        words: Vectors of the features; with `Looks`, features are histograms of the content of the damaged masks.
+        lengths: Lengths of the parts of features made of words, or measured cosines, for regions of parts of objects.
     """
     g, later = (torch.Generator().manual_seed(seed + more) for more in (0, LATER))
     cells = world.cells
@@ -145,7 +146,7 @@ def observe(
 
 
 def masks_of_cells(cells: Cells, classes: int, damage: Damage, g: torch.Generator) -> Tensor:
-    """[C] class of the mask that every cell lies in after masks moved and frayed, -1 for none."""
+    """Return [C], the class of the mask of every cell after masks have moved and frayed, or -1 for none."""
     views = len(cells.maps)
     whole = damage.pose * block_side(cells.maps) * _unit(views, g)
     each = damage.shifted * block_side(cells.maps) * _unit(views * classes, g).view(views, classes, 2)
@@ -162,14 +163,15 @@ def masks_of_cells(cells: Cells, classes: int, damage: Damage, g: torch.Generato
 
 
 def _look_up(cells: Cells, place: Tensor) -> Tensor:
-    """Exact class at places [C, 2] of the cells' views; that of the nearest pixel outside of the image."""
+    """Return the exact class at positions [C, 2] in the views of the cells, or of the nearest pixel outside of the
+    image."""
     height, width = cells.maps.shape[1:]
     x, y = place[:, 0].floor().long().clamp(0, width - 1), place[:, 1].floor().long().clamp(0, height - 1)
     return cells.maps[cells.view, y, x]
 
 
 def _merge_and_drop(size: Tensor, damage: Damage, g: torch.Generator) -> tuple[Tensor, Tensor]:
-    """[V, K] what every mask becomes part of, and whether that is missing."""
+    """Return [V, K] the mask that each mask is merged into, and [V, K] whether the resulting mask is missing."""
     views, classes = size.shape
     joins = torch.rand(views, classes, generator=g) < damage.merged
     chance = torch.rand(views, classes, classes, generator=g) * (size > 0)[:, None] * (1 - torch.eye(classes))
@@ -179,7 +181,7 @@ def _merge_and_drop(size: Tensor, damage: Damage, g: torch.Generator) -> tuple[T
 
 
 def _grouped(cells: Cells, label: Tensor, size: Tensor, damage: Damage, g: torch.Generator) -> Tensor:
-    """[V, K] what every mask becomes part of."""
+    """Return [V, K], the mask that each mask is merged into."""
     views, classes = size.shape
     partner = torch.arange(classes).repeat(views, 1)
     key, there = _key(cells.view, label.clamp(min=0), classes), (label >= 0).float()
@@ -197,7 +199,7 @@ def _grouped(cells: Cells, label: Tensor, size: Tensor, damage: Damage, g: torch
 
 
 def _arc(world: World, classes: Tensor, damage: Damage, g: torch.Generator) -> Tensor:
-    """[V, K] wrong class of every object in the views of its arc, -1 in the others."""
+    """Return [V, K], the wrong class of every object in the views of its arc, or -1 in other views."""
     rank = world.azimuth_rank
     views = len(rank)
     start = torch.randint(0, views, (world.classes,), generator=g)
@@ -206,7 +208,7 @@ def _arc(world: World, classes: Tensor, damage: Damage, g: torch.Generator) -> T
 
 
 def _halves(cells: Cells, label: Tensor, classes: int, damage: Damage, g: torch.Generator) -> Tensor:
-    """[C] 0 or 1: side of the cut of its mask that a cell lies on."""
+    """Return [C], 0 or 1 for the side of the cut of its mask on which a cell lies."""
     views = len(cells.maps)
     key = _key(cells.view, label.clamp(min=0), classes)
     count = torch.bincount(key, minlength=views * classes).clamp(min=1)[:, None]
@@ -217,7 +219,7 @@ def _halves(cells: Cells, label: Tensor, classes: int, damage: Damage, g: torch.
 
 
 def choose_views(views: int, damage: Damage, g: torch.Generator) -> list[int]:
-    """The views that are used, in order."""
+    """Return the indices of the views that are used, in ascending order."""
     if damage.views is None:
         return list(range(views))
     start = int(torch.randint(0, views, (), generator=g))
@@ -231,7 +233,7 @@ def _factors(views: int, damage: Damage, g: torch.Generator) -> Tensor:
 
 
 def _weighted(evidence: Evidence, factor: Tensor) -> Evidence:
-    """Evidence with a factor [V] on the weight of each view."""
+    """Return evidence with a factor [V] on the weight of each view."""
     rows, blank = evidence.rows, evidence.unlabeled
     return replace(
         evidence,
@@ -245,5 +247,5 @@ def _key(view: Tensor, mask: Tensor, classes: int) -> Tensor:
 
 
 def _unit(count: int, g: torch.Generator) -> Tensor:
-    """[count, 2] unit vectors."""
+    """Return [count, 2] random unit vectors."""
     return normalize(torch.randn(count, 2, generator=g), dim=1)

@@ -1,4 +1,4 @@
-"""Results files, read: what the tables and plots of the documentation are made of."""
+"""Reader of results files, from which the tables and plots of the documentation are made."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class Document:
-    """One results file."""
+    """Content of one results file."""
 
     command: str
     hardware: str
@@ -48,7 +48,7 @@ class Document:
         return {metric.key: metric.value for metric in self.metrics}
 
     def interval(self, key: str, digits: int = 1) -> str:
-        """Mean and half of its 95 % interval; empty where it was not measured."""
+        """Return the mean and half of its 95 % interval as text, or "" if the key was not measured."""
         v = self.values
         return f"{v[key]:.{digits}f} ± {v[f'{key}_ci95']:.{digits}f}" if key in v else ""
 
@@ -57,7 +57,7 @@ Documents = Mapping[str, Document]
 
 
 def read(path: Path) -> Document:
-    """The document of one results file; one without metrics where there is no file."""
+    """Return the document of a results file, or a document without metrics if the file does not exist."""
     if not path.exists():
         return Document(f"python -m research.{path.stem.removesuffix('_gpu')}", "no machine so far", ())
     content = json.loads(path.read_text())
@@ -66,7 +66,7 @@ def read(path: Path) -> Document:
 
 
 def documents() -> Documents:
-    """All results files that the pages speak of, by their names."""
+    """Return all results files that the pages use, by name."""
     names = (
         "cpu", "forms", "presets", "h100", "accuracy", "fit", "signals", "losses", "numerics", "numerics_gpu",
         "overhead", "grid", "grid_real", "geometry", "segments", "planning_gpu",
@@ -76,12 +76,12 @@ def documents() -> Documents:
 
 
 def steps(accuracy: Document) -> list[str]:
-    """Names of the steps of the ladder of damage."""
+    """Return the names of the steps of the ladder of damage."""
     start, end = "tabletop.ladder.", ".paper.miou"
     return [k.removeprefix(start).removesuffix(end) for k in accuracy.values if k.startswith(start) and k.endswith(end)]
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """Return a Markdown table."""
     lines = ["| " + " | ".join(cells) + " |" for cells in (header, *rows)]
     return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]]) + "\n"

@@ -1,4 +1,4 @@
-"""Draws the boxes of a catalogue into the photographs that show most of each object, to be looked at.
+"""Draw the boxes of a catalog into the images that show most of each object, for inspection.
 
 python -m research.draw_boxes outputs/…/normlift/…/config.yml /tmp/boxes --texts mug bowl
 """
@@ -19,7 +19,7 @@ EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
 
 
 def drawn(scene: Scene, name: str, found: CatalogueObject) -> Image.Image:
-    """The photograph with the edges of the box, and the centroid as a dot."""
+    """Return the image with the edges of the box, and the centroid as a dot."""
     view = scene.train[list(scene.train.names).index(name)]
     image = Image.fromarray(view.image.numpy())
     pen, pose, K = ImageDraw.Draw(image), view.camera.world_to_camera.double().numpy(), view.camera.K.double().numpy()
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("config")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--texts", nargs="+", required=True)
-    parser.add_argument("--objects", type=int, default=1, help="of each text")
+    parser.add_argument("--objects", type=int, default=1, help="objects to draw for each text")
     given = parser.parse_args()
     run = nl.open_run(given.config)
     given.folder.mkdir(parents=True, exist_ok=True)

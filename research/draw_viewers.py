@@ -1,8 +1,8 @@
 """docs/viewer_own.jpg, viewer_overlay.jpg and viewer_isolated.jpg: both viewers on the demo room, in Chromium.
 
-python -m research.draw_viewers [FOLDER of both lifted runs of the demo]      after make demo; nothing is saved in them
+python -m research.draw_viewers [FOLDER of both lifted runs of the demo]      after make demo; the runs do not change
 
-The page searches with the trained networks, the panel in nerfstudio's viewer by color names.
+The page uses the trained networks, and the panel in nerfstudio's viewer uses color names.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from tests.browser.viewer import TITLE, Tab
 
 RUNS = Path("demo/outputs/room/normlift")
 ASKED, STOCK = "banana, wine bottle", "tomato red, banana yellow"
-"""Things that the first views of the two viewers show."""
+"""Objects that the first views of the two viewers show."""
 CLICKED = (0.35, 0.85)
-"""Where the pumpkin is in the picture of the first view, as fractions of its width and height."""
+"""Position of the pumpkin in the image of the first view, as fractions of its width and height."""
 
 
 def main(runs: Path) -> None:
-    """Draws the three pictures."""
+    """Draw the three figures."""
     config = runs / "demo" / "config.yml"
     log = Path(tempfile.mkdtemp()) / "log"
     with chromium() as browser:
@@ -41,7 +41,7 @@ def main(runs: Path) -> None:
 
 
 def own(browser: Browser, address: str) -> None:
-    """ns-normlift-view with an answer."""
+    """Draw ns-normlift-view with an answer."""
     page = OnPage(browser, address, size=(1200, 720))
     page.page.emulate_media(color_scheme="dark")
     page.page.reload()
@@ -54,7 +54,7 @@ def own(browser: Browser, address: str) -> None:
 
 
 def stock(browser: Browser, address: str) -> None:
-    """ns-viewer with an answer, and with one thing alone."""
+    """Draw ns-viewer with an answer, and with one isolated object."""
     tab = Tab(browser, address, size=(1300, 947))
     tab.fresh()
     tab.asks(STOCK, answered=2)
@@ -73,7 +73,7 @@ def stock(browser: Browser, address: str) -> None:
 
 
 def shot(page: Page, name: str) -> None:
-    """Keeps the page as a JPEG of the documentation, at most 1,200 pixels wide."""
+    """Save the page as a JPEG file of the documentation, at most 1,200 pixels wide."""
     image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     image.thumbnail((1200, 1200))
     image.save(DOCS / f"{name}.jpg", quality=88)

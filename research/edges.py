@@ -1,15 +1,15 @@
-"""Regions between learned edges on photographs: error of the network, times, and how well regions fit hand labels.
+"""Regions between learned edges on photographs: error of the network, times, and agreement with labels drawn by hand.
 
     python -m research.edges                   the fox: error, seconds per image, fit; results/edges.json
     python -m research.edges --device cuda     error, seconds per image, differences from a CPU; results/edges_gpu.json
     python -m research.edges --clip            CLIP ViT-B-16 on a CPU, in patches and on crops; results/edges_clip.json
 
-*Error*: the largest difference of edge probabilities on a crop of 300 x 300 from numpy in float64, which reads the
-weight file by itself (`tests/encoders/hed.py`).
+*Error*: the largest difference of edge probabilities between the network and numpy in float64, on a crop of 300 x 300
+pixels. The numpy version (`tests/encoders/hed.py`) reads the weight file independently.
 
-*Fit* of a label: the largest IoU with it that a union of regions has, in the mean over six images. If regions are
-sorted by the share that is inside the label, the best union is one of the first k. SLIC makes as many superpixels as
-there are regions, or the next larger number that it can.
+*Fit* of a label: the largest IoU of a union of regions with the label, as the mean over six images. If regions are
+sorted by their share inside the label, the best union consists of the first k. SLIC makes as many superpixels as there
+are regions, or the next larger number that it can.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from tests.encoders.hed import edge_probability
 
 CAPTURES = SHARED / "captures"
 PIXELS = (2**17, 481 * 321, WORKING_PIXELS, 2**20)
-"""Working sizes; 481 x 321 is that of the training images, and 2**20 leaves the fox as it is."""
+"""Working sizes. 481 x 321 is the size of the training images, and 2**20 leaves the images of the fox unchanged."""
 
 
 def main() -> None:
@@ -71,7 +71,8 @@ def measure_error(report: Report, source: EdgeRegions, crop: torch.Tensor) -> No
 
 
 def measure_time(report: Report, source: EdgeRegions, paths: list[Path]) -> None:
-    """Add the times of images of two sizes, and whether regions repeat. Other programs only add to the least time."""
+    """Add the times for images of two sizes, and whether regions are reproducible. The shortest time excludes other
+    programs."""
     photographs = [read_image(path) for path in paths[:12]]
     large = [torch.from_numpy(np.array(Image.fromarray(x.numpy()).resize((1080, 1920)))) for x in photographs]
     for name, images in (("540x960", photographs), ("1080x1920", large)):
@@ -141,7 +142,7 @@ def candidates(
 
 
 def read_labels(path: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Return the mask of every label by image. Later polygons cover earlier ones, except those of parts."""
+    """Return the mask of every label by image. Later polygons cover earlier ones, except for those of parts."""
     table, found = json.loads(path.read_text()), {}
     for label in table["labels"]:
         canvas = Image.new("1", tuple(table["size"]))

@@ -1,13 +1,13 @@
-"""Small faults planted in the package, to see whether the tests find them.
+"""Small faults planted in the package, to measure how many of them the tests find.
 
     python -m research.faults draw --seed 1 --output faults.json
     python -m research.faults run faults.json --trees ../checkout --tier test --label old
     python -m research.faults table faults.json
 
-`draw` takes places by a seed, some in every package, and keeps those that pass lint, types and import. `run` plants
-each in another checkout that has a `.venv`, and runs the nearest test files first; those that remain are planted
-together, and the whole tier runs once. Where a test fails then, each fault is tried with that test alone. So a fault
-counts as found if a test fails that passes without it.
+`draw` chooses places in every package by a seed, and keeps the faults that pass lint and type checks and can be
+imported. `run` plants each fault in another checkout that has a `.venv`, and runs the nearest test files first. The
+remaining faults are planted together, and the whole tier runs once. If tests fail, each fault is tried with these tests
+alone. A fault is found if a test fails with it and passes without it.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ BOUNDS = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
 
 @dataclass(frozen=True)
 class Fault:
-    """One change of one file."""
+    """A change of one file."""
 
     name: str
     package: str
@@ -101,9 +101,9 @@ class Fault:
     function: str
     patch: str
     found: dict[str, str] | None = None
-    """By tier, the test that finds it, or "" if none does."""
+    """Test that finds the fault, by label of the run; "" if no test finds it."""
     equivalent: str = ""
-    """Why no test can find it, for faults that change nothing."""
+    """Reason why no test can find the fault, for faults that change nothing."""
 
 
 Node = ast.expr | ast.stmt
@@ -111,14 +111,14 @@ Edit = tuple[str, Node, str]
 
 
 def edits(tree: ast.Module) -> Iterator[tuple[str, Node, str, str]]:
-    """Every kind, node, new text and name of the function around it."""
+    """Yield the kind, node, new text and enclosing function of every possible edit."""
     for node, function in _code(tree, ""):
         for kind, place, text in _edits(node):
             yield kind, place, text, function
 
 
 def _code(node: ast.AST, function: str) -> Iterator[tuple[ast.AST, str]]:
-    """Nodes that run: no annotations, no docstrings, nothing for types alone."""
+    """Yield the nodes that run, without annotations, docstrings and code for type checkers."""
     yield node, function
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         function = f"{function}.{node.name}".lstrip(".")
@@ -235,7 +235,7 @@ def _inverted(test: ast.expr) -> str:
 
 
 def changed(source: str, node: Node, text: str) -> str:
-    """A source with a node replaced."""
+    """Return a source with a node replaced."""
     data = source.encode()
     starts = [0]
     for line in data.splitlines(keepends=True):
@@ -246,7 +246,7 @@ def changed(source: str, node: Node, text: str) -> str:
 
 
 def draw(root: Path, seed: int, most: int) -> list[Fault]:
-    """So many faults of every package, at most one in a file, that pass lint, types and import."""
+    """Return up to `most` faults per package, at most one per file, that pass lint, types and import."""
     chance, faults, spent = random.Random(seed), [], set()
     for package in PACKAGES:
         folder = root / "normlift_ns" / package
@@ -280,7 +280,7 @@ def draw(root: Path, seed: int, most: int) -> list[Fault]:
 
 
 def passed(root: Path, fault: Fault) -> str:
-    """The formatted patch of a fault, or "" if lint, types or import have something against it."""
+    """Return the formatted patch of a fault, or "" if lint, types or import fail."""
     module = fault.file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
     binaries = root / ".venv/bin"
     checks = (
@@ -297,7 +297,10 @@ def passed(root: Path, fault: Fault) -> str:
 
 
 def replanted(source: str, fault: Fault) -> str:
-    """The source with a fault, wherever its lines are now; of several places, the one with most of the lines around."""
+    """Return the source with a fault, which is found by its lines.
+
+    If they occur several times, the place with most of the surrounding lines counts.
+    """
     lines = source.splitlines()
     for hunk in re.split(r"(?m)^@@ .*\n", fault.patch)[1:]:
         rows = [x for x in hunk.splitlines() if x[:1] in ("+", "-", " ")]
@@ -315,7 +318,7 @@ def replanted(source: str, fault: Fault) -> str:
 
 
 def stands(root: Path, fault: Fault) -> bool:
-    """Whether a tree still has the lines of a fault."""
+    """Return True if a tree still has the lines of a fault."""
     path = root / fault.file
     try:
         return path.exists() and replanted(path.read_text("utf8"), fault) != ""
@@ -325,7 +328,7 @@ def stands(root: Path, fault: Fault) -> bool:
 
 
 class planted:
-    """Puts faults into a tree, and takes them back."""
+    """Context in which a tree contains faults."""
 
     def __init__(self, root: Path, faults: list[Fault]) -> None:
         self.root, self.faults = root, faults
@@ -342,17 +345,17 @@ class planted:
 TIERS = ("test", "slow")
 TIME_OUT = "time-out"
 DEFAULTS = "tests/test_defaults.py"
-"""The test of recorded defaults, which names no function."""
+"""Test of recorded defaults, which names no function."""
 
 
 def marker(root: Path, tier: str) -> str:
-    """The tests of a tier; checkouts from before the tier `extra` have no such marker."""
+    """Return the marker expression of a tier. Old checkouts have no marker `extra`."""
     extra = " and not extra" if '"extra: ' in (root / "pyproject.toml").read_text("utf8") else ""
     return ("slow" if tier == "slow" else "not slow") + extra
 
 
 def pytest(root: Path, tier: str, *words: str, limit: float) -> list[str]:
-    """Names of tests that fail; `TIME_OUT` if they do not end, "collection" if none could run."""
+    """Return the names of failing tests; `TIME_OUT` if they do not end, "collection" if none could run."""
     command = [".venv/bin/python", "-m", "pytest", "-q", "--no-header", "-rfE", "-m", marker(root, tier), *words]
     process = subprocess.Popen(
         command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
@@ -389,13 +392,7 @@ def nearest(root: Path, fault: Fault, most: int = 8) -> list[str]:
 
 
 def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Path, *, together: bool) -> None:
-    """Looks for every fault with the nearest files, then for the rest with the whole tier; saves what is found.
-
-    Args:
-        trees: equal checkouts, each with a `.venv`; so many faults are tried at a time.
-        label: the name of what is run, a column of the table.
-        together: begin with all faults planted together.
-    """
+    """Search a test for every fault, first in the nearest files and then in the whole tier, and save the results."""
     found = {x.name: dict(x.found or {}) for x in faults}
     free: Queue[Path] = Queue()
     for tree in trees:
@@ -407,7 +404,7 @@ def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Pat
         save.write_text(json.dumps([asdict(replace(x, found=found[x.name])) for x in faults], indent=1) + "\n")
 
     def first(fault: Fault, words: list[str], limit: float) -> str:
-        """The first test that fails with a fault and passes without it."""
+        """Return the first test that fails with a fault and passes without it, or ""."""
         tree = free.get()
         try:
             with planted(tree, [fault]):
@@ -455,7 +452,7 @@ def run(faults: list[Fault], trees: list[Path], tier: str, label: str, save: Pat
 
 
 def load(path: Path) -> list[Fault]:
-    """The faults of a file."""
+    """Return the faults of a file."""
     return [Fault(**x) for x in json.loads(path.read_text("utf8"))]
 
 
@@ -464,11 +461,11 @@ COLUMNS = {
     "make test": ("make test",),
     "and make test-slow": ("make test", "make test-slow"),
 }
-"""Columns of the table, and the labels of the runs that count."""
+"""Labels of the runs that count, by column of the table."""
 
 
 def table(faults: list[Fault]) -> str:
-    """Found of those that change something, by package and by what was run."""
+    """Return a table of the faults found, by package and by run. Equivalent faults are counted separately."""
     lines = [f"| package | faults | equivalent | {' | '.join(COLUMNS)} |", f"|---|{'---:|' * (len(COLUMNS) + 2)}"]
     for package in [*PACKAGES, "all"]:
         here = [x for x in faults if package in (x.package, "all")]
@@ -482,7 +479,7 @@ def table(faults: list[Fault]) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(
-        description="Plants small faults in the package, to see whether the tests find them."
+        description="Plant small faults in the package, and measure how many the tests find."
     )
     actions = parser.add_subparsers(dest="action", required=True)
     drawing = actions.add_parser("draw")

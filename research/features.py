@@ -1,10 +1,10 @@
-"""2D features of regions, by what an encoder's features are like: six statistics, pure functions with a generator.
+"""Features of regions with six kinds of statistics, like those of different encoders; pure functions with a generator.
 
-Made of words, the feature of a mask is normalise(t + C c + O o + N n): t the text vector of its class, c one direction
-that all image features share (the modality gap), o a direction of the object's own, n noise of this mask in this view.
-c and o are orthogonal to the classes. A region that is no thing shows a mixture of classes: t and o are then means over
-its pixels. The noise follows the covariance of text vectors, so that it is confusion rather than static, or is the same
-in all directions.
+Made of words, the feature of a mask is normalize(t + C c + O o + N n). Here, t is the text vector of its class, c is a
+direction that all image features share (the modality gap), and o is a direction of the object. n is the noise of this
+mask in this view. c and o are orthogonal to the classes. A region that does not follow an object shows a mixture of
+classes, so t and o are means over its pixels. The noise follows the covariance of text vectors, so that it resembles
+confusion with other classes, or is the same in all directions.
 
 | statistic | one object in two views | two objects | |
 |---|---|---|---|
@@ -12,12 +12,11 @@ in all directions.
 | isotropic | 0.13 | 0.10 | text vectors with the same noise in all directions, no modality gap |
 | low contrast | 0.90 | 0.85 | a long common direction |
 | orthogonal | 0.26 | 0 | texts in random directions, no modality gap |
-| histogram | as it is | as it is | colour and gradient of rendered pictures, see `looks` |
-| real | 0.39 to 0.77 | 0.22 | as measured on photographs, in `research.real_features`; decides nothing |
+| histogram | that of the images | that of the images | color and gradient of rendered images, see `Looks` |
+| real | 0.39 to 0.77 | 0.22 | as measured on photographs, in `research.real_features`; not used for decisions |
 
-The cosines are those of step "noise only" with 512 dimensions. The lengths of the noise of isotropic and orthogonal
-features are chosen so that, at step "noise", a single feature is about as often nearest to another class's text as a
-CLIP-like one.
+The cosines are those of step "noise only" with 512 dimensions. The noise of isotropic and orthogonal features is as
+long as makes a single feature at step "noise" about as often nearest to the text of another class as a CLIP-like one.
 """
 
 from __future__ import annotations
@@ -34,19 +33,19 @@ from normlift_ns import Camera, GaussianScene, render
 from research.synthetic_scenes import Words, World
 
 COLOUR_STEPS, ANGLES = 4, 8
-"""Bins of every channel of sRGB, and of the directions of gradients without their sign."""
+"""Number of bins of every sRGB channel, and of gradient directions without their sign."""
 
 
 @dataclass(frozen=True)
 class Lengths:
-    """Of the parts of a feature, beside a text vector of length 1."""
+    """Lengths of the parts of a feature, relative to a text vector of length 1."""
 
     common: float = 2.2
     own: float = 1.2
     noise: float = 1.0
-    """Factor on the length of a damage's noise."""
+    """Factor on the length of the noise of a damage."""
     isotropic: bool = False
-    """The noise is the same in all directions, instead of following the covariance of text vectors."""
+    """True if the noise is the same in all directions, False if it follows the covariance of text vectors."""
 
 
 LENGTHS = {
@@ -55,12 +54,12 @@ LENGTHS = {
     "low contrast": Lengths(common=3.13, own=0.6, noise=0.925),
     "orthogonal": Lengths(common=0.0, own=1.0, noise=2.0),
 }
-"""Of the statistics that are made of words."""
+"""Lengths of the statistics that are made of words."""
 STATISTICS = (*LENGTHS, "histogram")
 
 
 def orthogonal_words(classes: int, dimension: int = 512, seed: int = 0) -> Words:
-    """Vectors in random directions of a space of 100."""
+    """Return vectors in random directions of a space of 100 dimensions."""
     g = torch.Generator().manual_seed(seed)
     space = torch.linalg.qr(torch.randn(dimension, 100, generator=g)).Q.T
     words = normalize(torch.randn(classes + 1000, 100, generator=g) @ space, dim=1)
@@ -68,7 +67,7 @@ def orthogonal_words(classes: int, dimension: int = 512, seed: int = 0) -> Words
 
 
 def mistaken(masks: Tensor, classes: Tensor, g: torch.Generator) -> Tensor:
-    """Another class for every mask, near ones more often."""
+    """Return another class for every mask; similar classes are more likely."""
     near = torch.softmax(20 * (classes @ classes.T).fill_diagonal_(-torch.inf), dim=1)
     return torch.multinomial(near[masks], 1, generator=g).squeeze(1) if len(masks) > 0 else masks
 
@@ -76,11 +75,11 @@ def mistaken(masks: Tensor, classes: Tensor, g: torch.Generator) -> Tensor:
 def mask_features(
     words: Words, masks: Tensor, forced: Tensor, wrong: float, noise: float, lengths: Lengths, g: torch.Generator
 ) -> Tensor:
-    """[S, D] unit features of masks of the given classes.
+    """Return [S, D] unit features of masks of the given classes.
 
     Args:
-        forced: [S] class that a mask shows whatever else is drawn, -1: none.
-        wrong: share of masks that show another class.
+        forced: [S] class that a mask shows in any case, or -1 for none.
+        wrong: Share of masks that show another class.
     """
     free = _free(words, g)
     other = mistaken(masks, words.classes, g)
@@ -95,7 +94,8 @@ def mask_features(
 def mixture_features(
     words: Words, content: Tensor, wrong: float, noise: float, lengths: Lengths, g: torch.Generator
 ) -> Tensor:
-    """[S, D] unit features of regions that show shares [S, K + 1] of the classes, the last of the background."""
+    """Return [S, D] unit features of regions, given their shares [S, K + 1] of the classes and, last, of the
+    background."""
     count = content.shape[1] - 1
     free = _free(words, g)
     vectors = torch.cat([words.classes, words.others[-1:]])  # the background has a word of its own
@@ -109,7 +109,7 @@ def mixture_features(
 
 
 def _free(words: Words, g: torch.Generator) -> Tensor:
-    """[K + 1, D] unit directions orthogonal to the classes: one of every object, and the common one."""
+    """Return [K + 1, D] unit directions orthogonal to the classes: one per object, and the common one last."""
     basis = torch.linalg.qr(words.classes.T).Q
     random = torch.randn(len(words.classes) + 1, words.classes.shape[1], generator=g)
     return normalize(random - random @ basis @ basis.T, dim=1)
@@ -124,18 +124,18 @@ def _noise(words: Words, count: int, lengths: Lengths, g: torch.Generator) -> Te
 
 @dataclass(frozen=True)
 class Looks:
-    """Histograms in place of words."""
+    """Histograms that replace words."""
 
     pieces: Tensor
     """[C, B] sums over the pixels of every cell of the training views, or of every region."""
     masks: Tensor
-    """[V, K, B] sums over the exact masks of the training views, 0 where a class is out of sight."""
+    """[V, K, B] sums over the exact masks of the training views, or 0 if a class is not visible."""
     classes: Tensor
-    """[K, B] unit: of the exact masks of all held-out views, what a text would know of a class."""
+    """[K, B] unit histograms of the exact masks of all held-out views, which take the place of text vectors."""
 
 
 def as_features(sums: Tensor) -> Tensor:
-    """[S, B] unit: square roots of the shares of the bins, colour and gradient of equal weight (Hellinger's)."""
+    """Return [S, B] unit features: square roots of the shares of the bins, with equal weight for color and gradient."""
     colours = COLOUR_STEPS**3
     parts = sums.clamp(min=0).split([colours, sums.shape[1] - colours], dim=1)
     shares = [part / part.sum(1, keepdim=True).clamp(min=1e-12) for part in parts]
@@ -143,14 +143,14 @@ def as_features(sums: Tensor) -> Tensor:
 
 
 def mask_looks(looks: Looks, index: Tensor, masks: Tensor, forced: Tensor, wrong: float, g: torch.Generator) -> Tensor:
-    """[S, B] features of masks made of cells.
+    """Return [S, B] features of masks made of cells.
 
-    A wrong mask looks as the exact mask of another class does in a random view where that is in sight.
+    A wrong mask looks like the exact mask of another class in a random view in which that class is visible.
 
     Args:
-        index: [C] mask of every cell, -1: none.
-        masks: [S] their classes.
-        forced: as in `mask_features`.
+        index: [C] mask of every cell, or -1 for none.
+        masks: [S] class of each mask.
+        forced: As in `mask_features`.
     """
     inside = index >= 0
     sums = torch.zeros(len(masks), looks.pieces.shape[1]).index_add_(0, index[inside], looks.pieces[inside])
@@ -160,27 +160,27 @@ def mask_looks(looks: Looks, index: Tensor, masks: Tensor, forced: Tensor, wrong
 
 
 def region_looks(looks: Looks, content: Tensor, wrong: float, g: torch.Generator) -> Tensor:
-    """[S, B] features of the regions themselves, wrong ones as in `mask_looks`."""
+    """Return [S, B] features of the regions themselves, with wrong ones as in `mask_looks`."""
     other = mistaken(content[:, :-1].argmax(1), looks.classes, g)
     struck = torch.rand(len(content), generator=g) < wrong
     return as_features(_struck(looks, looks.pieces, other, struck, g))
 
 
 def _struck(looks: Looks, sums: Tensor, other: Tensor, struck: Tensor, g: torch.Generator) -> Tensor:
-    """Sums [S, B], where struck those of another class in a random view."""
+    """Return sums [S, B], with those of another class in a random view for the rows in `struck`."""
     chance = torch.rand(len(sums), len(looks.masks), generator=g) * (looks.masks.sum(2).T > 0)[other]
     return torch.where(struck[:, None], looks.masks[chance.argmax(1), other], sums)
 
 
 def pictures(scene: GaussianScene, colors: Tensor, cameras: Sequence[Camera]) -> list[Tensor]:
-    """Rendered pictures [H, W, 3] in 0..1, on black."""
+    """Return rendered images [H, W, 3] in 0..1, on black."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     scene, colors = scene.to(device), colors.to(device)
     return [render(scene, camera, colors)[0].clamp(0, 1).cpu() for camera in cameras]
 
 
 def pixel_bins(picture: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of every pixel [P]: its bin of colour; its bin of gradient; how long the gradient is."""
+    """Return, for every pixel [P], its color bin, its gradient bin and the length of its gradient."""
     colour = (picture * COLOUR_STEPS).long().clamp(0, COLOUR_STEPS - 1)
     colour = (colour[..., 0] * COLOUR_STEPS + colour[..., 1]) * COLOUR_STEPS + colour[..., 2]
     grey = (picture @ picture.new_tensor([0.299, 0.587, 0.114])).numpy()
@@ -190,7 +190,7 @@ def pixel_bins(picture: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def histograms(pictures: Sequence[Tensor], labels: Sequence[Tensor], count: int) -> Tensor:
-    """[count, B] sums over the pixels of every label of all views; pixels without one have -1."""
+    """Return [count, B] sums over the pixels of every label of all views; pixels without a label have -1."""
     colours = COLOUR_STEPS**3
     out = torch.zeros(count, colours + ANGLES)
     for picture, of_view in zip(pictures, labels, strict=True):
@@ -203,13 +203,13 @@ def histograms(pictures: Sequence[Tensor], labels: Sequence[Tensor], count: int)
 
 
 def class_histograms(pictures: Sequence[Tensor], maps: Tensor, classes: int) -> Tensor:
-    """[V, K, B] sums over exact masks [V, H, W]."""
+    """Return [V, K, B] sums over exact masks [V, H, W]."""
     of_view = [torch.where(one >= 0, one + v * classes, -1) for v, one in enumerate(maps)]
     return histograms(pictures, of_view, len(maps) * classes).view(len(maps), classes, -1)
 
 
 def world_looks(world: World) -> Looks:
-    """Of the cells of a world whose Gaussians have colours."""
+    """Return the histograms of a world whose Gaussians have colors."""
     assert world.colors is not None, world.name
     seen, held_out = (pictures(world.scene, world.colors, some) for some in (world.cameras, world.held_out))
     return Looks(

@@ -1,15 +1,15 @@
-"""Hyper-parameters of the vote, fitted on some damages and seeds and reported on others; sensitivity curves.
+"""Fit of the hyper-parameters of the vote on some damages and seeds, evaluated on others, with sensitivity curves.
 
     python -m research.fit                                        tabletop and plain room, for a GPU
     python -m research.fit --scenes demo --voters 500 --seeds 1   for CPUs
 
-Procedure: K stays at 36, because the time of the vote grows with its square, and sigma_d at 1 or more, because below
-that nobody but the Gaussian itself has a say; the curves go further. Every combination in `SEARCH` is tried on `FIT`
-(damages, all scenes, seeds from 100 on); the highest mean mIoU wins. Then `START` and the winner are compared on
-`HELD_OUT` (other damages, seeds from 200 on), with 95 % intervals of the paired difference, the curve of every
-parameter around the winner, and the other readings of unlabelled pixels and of the weights. Plain voting has its own
-best combination, which tells parameters from method. Two earlier searches with wider grids went to their ends, K = 60
-and sigma_d = 0.25, before these bounds were set. Writes results/fit.json.
+K stays at 36, because the time of the vote grows with its square. sigma_d is at least 1, because below 1 only the
+Gaussian itself has an influence. The curves extend further. Every combination in `SEARCH` is tried on `FIT` (damages,
+all scenes, seeds from 100 on), and the highest mean mIoU wins. Then `START` and the winner are compared on `HELD_OUT`
+(other damages, seeds from 200 on). Results are 95 % intervals of the paired difference, a curve of every parameter
+around the winner, and other treatments of unlabeled pixels and of the weights. Plain voting has its own best
+combination, to separate the effect of parameters from that of the method. Two earlier searches with wider grids reached
+their ends, K = 60 and sigma_d = 0.25, before these bounds were set. The command writes results/fit.json.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ MOST = int(max(CURVES["k"]))
 
 @dataclass(frozen=True)
 class Observation:
-    """One damaged lift with the cosines among the neighbours of a sample of Gaussians: any vote is cheap then."""
+    """A damaged lift with the cosines between the neighbors of a sample of Gaussians, from which any vote is fast."""
 
     scene: str
     damage: str
     seed: int
     scores: Scores
     group: Tensor
-    """[M, 1 + MOST] voters and their neighbours, -1 where there are fewer."""
+    """[M, 1 + MOST] voters and their neighbors, or -1 for missing neighbors."""
     distance: Tensor
     """[M, 1 + MOST], in units of the scene's median spacing."""
     gram: Tensor
@@ -73,17 +73,17 @@ class Observation:
     n_eff: Tensor
     """[N]"""
     diluted: Tensor
-    """R with unlabelled pixels as observations of nothing."""
+    """R with unlabeled pixels as views without a feature."""
     truth: Tensor
     """[M]"""
 
     def reliability(self, beta: float) -> Tensor:
-        """R for another beta."""
+        """Return R for another beta."""
         n = self.n_eff
         return torch.where(n > 0, self.norm * n / (n + beta), 0.0)
 
     def sources(self, config: RefineConfig, reliability: Tensor) -> Tensor:
-        """[M] whose direction every voter takes: equations 9 and 10, as `refine` evaluates them."""
+        """Return [M], the Gaussian whose direction each voter takes: equations 9 and 10, as in `refine`."""
         size, numbers = config.k + 1, config.numbers
         group, distance = self.group[:, :size], self.distance[:, :size]
         r = torch.where(group >= 0, reliability[group.clamp(min=0)], 0.0)
@@ -98,13 +98,13 @@ class Observation:
         return torch.where(wins, group.gather(1, choice[:, None] + 1).squeeze(1), group[:, 0])
 
     def miou(self, config: RefineConfig, reliability: Tensor | None = None) -> float:
-        """mIoU of the sample after the vote, in points."""
+        """Return the mIoU of the sample after the vote, in percentage points."""
         source = self.sources(config, self.reliability(1.0) if reliability is None else reliability)
         found = classify(self.scores.cosine[source], self.scores.valid[source])
         return 100 * class_scores(confusion(self.truth, found, self.scores.cosine.shape[1])).miou
 
     def unrefined(self) -> float:
-        """mIoU of the sample before the vote, in points."""
+        """Return the mIoU of the sample before the vote, in percentage points."""
         own = self.group[:, 0]
         found = classify(self.scores.cosine[own], self.scores.valid[own])
         return 100 * class_scores(confusion(self.truth, found, self.scores.cosine.shape[1])).miou
@@ -113,7 +113,7 @@ class Observation:
 def observation(
     world: World, words: Words, name: str, damage: Damage, seed: int, neighbors: Neighbors, voters: Tensor
 ) -> Observation:
-    """Lifts, and multiplies the directions of every voter's neighbours with each other."""
+    """Lift one observation, and compute the cosines between the neighbors of every voter."""
     observed = observe(world, words, damage, seed)
     lifted = lift(observed.evidence, observed.features)
     diluted = lift(observed.evidence, observed.features, unlabeled="dilute").scalars.reliability
@@ -134,7 +134,7 @@ def observation(
 
 @dataclass(frozen=True)
 class Site:
-    """A scene and what all observations of it share."""
+    """A scene with the data that all observations of it share."""
 
     world: World
     words: Words
@@ -143,7 +143,7 @@ class Site:
     def observations(
         self, damages: Sequence[str], seeds: Sequence[int], voters: int, weight_power: Literal[1, 2] = 1
     ) -> Iterator[Observation]:
-        """A sample of voters per seed."""
+        """Yield an observation for each seed and damage, with a sample of voters per seed."""
         world = self.world
         if weight_power == 2:
             world = replace(world, evidence=world.squared.to(world.evidence.rows.weight.device))
@@ -156,23 +156,23 @@ class Site:
 
 
 def mean_miou(found: Sequence[Observation], config: RefineConfig) -> float:
-    """Mean over observations."""
+    """Return the mean mIoU over observations."""
     return float(np.mean([one.miou(config) for one in found]))
 
 
 def with_value(config: RefineConfig, parameter: str, value: float) -> RefineConfig:
-    """The configuration with one parameter changed."""
+    """Return the configuration with one parameter changed."""
     changed: dict[str, Any] = {parameter: int(value) if parameter == "k" else value}
     return replace(config, **changed)
 
 
 def plain(one: Observation) -> Tensor:
-    """R of plain voting."""
+    """Return the R of plain voting."""
     return (one.norm > 0).float()
 
 
 def fit(found: Sequence[Observation], search: Mapping[str, Sequence[float]] = SEARCH) -> tuple[RefineConfig, ...]:
-    """The best combination for the full method, and for plain voting."""
+    """Return the best combination for the full method, and that for plain voting."""
     combinations = [dict(zip(search, values)) for values in product(*search.values())]
     configs = [replace(START, **values) for values in combinations]
     full = [mean_miou(found, config) for config in configs]
@@ -227,6 +227,6 @@ if __name__ == "__main__":
     parser.add_argument("--scenes", nargs="+", default=["tabletop", "demo"], help="tabletop, demo")
     parser.add_argument("--voters", type=int, default=20_000, help="Gaussians that vote and count")
     parser.add_argument("--views", type=int, help="training views of the tabletop; all by default")
-    parser.add_argument("--seeds", type=int, default=5, help="repeats for the fit, and as many for the report")
+    parser.add_argument("--seeds", type=int, default=5, help="repeats for the fit, and for the report")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     main(parser.parse_args())

@@ -1,9 +1,9 @@
-"""What a semantic field costs on disk in its three forms, and what each does to queries, with and without consensus.
+"""Size of a semantic field in its three storage forms, and their effect on queries, with and without consensus.
 
-On the tabletop capture the exact instance masks are the regions; features are real CLIP text vectors of the objects'
-names, disturbed anew in every view by noise of a given length. Errors are measured on every eighth of the 1,203 names
-of the vector file, against float64 directions. On the tabletop, the plain room and the fox, the colour encoder sees
-masks or, where there are none, superpixels; its errors are measured on the survey's colour names.
+On the tabletop capture, the exact instance masks are the regions. Features are real CLIP text vectors of the names of
+the objects, with new noise of a given length in every view. Errors are measured on every eighth of the 1,203 names of
+the vector file, against float64 directions. On the tabletop, the plain room and the fox, the color encoder uses masks
+or, if there are none, superpixels. Its errors are measured on the color names of the survey.
 
     python -m research.forms
 """
@@ -42,7 +42,7 @@ CASES = (*(f"noise{noise}" for noise in NOISE), "demo_colour", "tabletop_colour"
 
 
 def mask_labels() -> list[Tensor]:
-    """The tabletop's twelve exact instance masks in its 44 training views."""
+    """Return the tabletop's twelve exact instance masks in its 44 training views."""
     folder = SHARED / "captures" / "tabletop" / "instance"
     return [
         torch.from_numpy(np.array(Image.open(folder / f"{i:04d}.png")).astype(np.int32)) - 1
@@ -51,7 +51,7 @@ def mask_labels() -> list[Tensor]:
 
 
 def mask_evidence() -> Evidence:
-    """Evidence of these masks."""
+    """Return the evidence of these masks."""
     labels = mask_labels()
     return rasterize_evidence(
         trained_scene("tabletop"), training_cameras("tabletop"), labels, num_regions=[12] * len(labels)
@@ -59,10 +59,10 @@ def mask_evidence() -> Evidence:
 
 
 class Case(NamedTuple):
-    """A scene that is lifted."""
+    """A scene to lift."""
 
     name: str
-    """Of the keys, with an underscore behind it."""
+    """Prefix of the keys, followed by an underscore."""
     means: Tensor
     evidence: Evidence
     features: Tensor
@@ -72,7 +72,7 @@ class Case(NamedTuple):
 
 
 def clip_cases(some: Sequence[str]) -> Iterator[Case]:
-    """The tabletop with noise of several lengths."""
+    """Yield the tabletop with noise of several lengths."""
     if not any(name.startswith("noise") for name in some):
         return
     evidence, means = mask_evidence(), trained_scene("tabletop").means
@@ -89,7 +89,7 @@ def clip_cases(some: Sequence[str]) -> Iterator[Case]:
 
 
 def colour_cases(some: Sequence[str]) -> Iterator[Case]:
-    """Mean colours of masks, or of superpixels where there are none."""
+    """Yield cases with the mean colors of masks, or of superpixels if there are none."""
     encoder, room = ColorEncoder(), plain_room()
     names = [name.removesuffix("_colour") for name in some if name.endswith("_colour")]
     queries = encoder.text(sorted(name.removeprefix("xkcd:") for name in XKCD_COLORS)[::5]).double()
@@ -109,7 +109,8 @@ def colour_cases(some: Sequence[str]) -> Iterator[Case]:
 
 
 def photographs(name: str, cameras: Sequence[Camera]) -> list[Tensor]:
-    """Of the training views, at the size of their cameras. Lens distortion stays: colours do not mind."""
+    """Return the training images at the size of their cameras. Lens distortion is kept, because it hardly affects
+    colors."""
     files = sorted((SHARED / "captures" / name / "images").iterdir())
     size = (cameras[0].width, cameras[0].height)
     pictures = (Image.open(files[i]).convert("RGB").resize(size) for i in training_indices(name))
@@ -117,7 +118,7 @@ def photographs(name: str, cameras: Sequence[Camera]) -> list[Tensor]:
 
 
 def compare(case: Case, tolerances: Sequence[float], report: Report, table: Table) -> None:
-    """All forms of one case at every tolerance."""
+    """Compare all storage forms of one case at every tolerance."""
     lifted = lift(case.evidence, case.features.float())
     some = torch.randperm(len(case.means), generator=torch.Generator().manual_seed(0))[:20000]
     exact = lift(case.evidence, case.features).directions(some) @ case.queries.T

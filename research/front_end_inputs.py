@@ -1,4 +1,4 @@
-"""What the benchmark of the front ends works on: networks with random weights, and masks of no network."""
+"""Inputs of the benchmark of the front ends: networks with random weights, and masks that no network predicts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from normlift_ns.segmentation.sam import MaskRules, SamMasks, SamNetwork
 
 @dataclass(frozen=True)
 class Size:
-    """How large everything is."""
+    """Sizes of images, masks and networks."""
 
     height: int = 731
     width: int = 988
@@ -32,9 +32,10 @@ class Size:
     vision: tuple[int, int, int, int] = (1280, 32, 16, 1024)
     """Width, layers, heads and input side of SAM's image encoder."""
     cold: int = 50
-    """Images of the process that begins without compiled kernels."""
+    """Number of images of the process that starts without compiled kernels."""
     siglip: tuple[int, int, int, int] = (768, 12, 12, 256_000)
-    """Width, layers and heads of both towers of SigLIP 2, and tokens of its vocabulary; by default those of base."""
+    """Width, layers and heads of both towers of SigLIP 2, and size of its vocabulary (default: those of the base
+    model)."""
 
 
 SMALL = Size(96, 128, (5, 10), 3, 30, "normlift-benchmark", (64, 2, 2, 128), 2, (32, 2, 2, 300))
@@ -71,7 +72,8 @@ def random_clip(size: Size, folder: Path, device: str) -> OpenClipEncoder:
 
 
 def random_siglip2(size: Size, folder: Path, device: str) -> HuggingFaceEncoder:
-    """SigLIP 2 at 224 pixels with patches of 16, written as transformers does, with a tokenizer of two tokens."""
+    """Write SigLIP 2 at 224 pixels with patches of 16 as transformers does, with a tokenizer of two tokens, and load
+    it."""
     width, layers, heads, vocabulary = size.siglip
     tower = {
         "hidden_size": width,
@@ -91,7 +93,8 @@ def random_siglip2(size: Size, folder: Path, device: str) -> HuggingFaceEncoder:
 
 
 def injected_masks(count: int, size: Size, g: torch.Generator, device: str) -> Tensor:
-    """[count, H, W] masks that cover the image; with ten or more, half of the pixels lie in two or more of them."""
+    """Return [count, H, W] masks that cover the image. With ten or more, half of the pixels lie in two or more of
+    them."""
     area = torch.exp(1.5 * torch.randn(count, generator=g))
     radius = (area / area.sum() * size.height * size.width / torch.pi).sqrt().to(device)
     centre = (torch.rand(count, 2, generator=g) * torch.tensor([size.height, size.width])).to(device)
@@ -107,7 +110,7 @@ def injected_masks(count: int, size: Size, g: torch.Generator, device: str) -> T
 
 
 def with_copies(masks: Tensor, g: torch.Generator) -> Tensor:
-    """The masks, three in ten of them replaced by others, moved by a pixel or two."""
+    """Return the masks with three in ten of them replaced by others, moved by up to two pixels."""
     masks = masks.clone()
     for i in torch.randperm(len(masks), generator=g)[: len(masks) * 3 // 10].tolist():
         other, dy, dx = torch.randint(0, len(masks), (3,), generator=g).tolist()
@@ -116,8 +119,10 @@ def with_copies(masks: Tensor, g: torch.Generator) -> Tensor:
 
 
 class Injected(SamNetwork):
-    """The network, whose answers are then replaced by blobs of three sizes around the points. The blobs are made once,
-    so that making them costs no time."""
+    """A network whose answers are replaced by blobs of three sizes around the points.
+
+    The blobs are made once, so that making them takes no time in later calls.
+    """
 
     side = 1024
     kept: dict[tuple[float, ...], tuple[Tensor, Tensor]]

@@ -1,4 +1,4 @@
-"""Times and errors of SAM's network alone, in every precision."""
+"""Times and errors of SAM's network alone, in each precision."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _REPEATS = 3
 
 
 def seconds(function: Callable[[], object], device: str) -> float:
-    """Best of some runs, after one that does not count."""
+    """Return the shortest time of some runs after a warm-up run."""
     times = []
     for _ in range(1 + _REPEATS):
         start = time.perf_counter()
@@ -33,7 +33,7 @@ def seconds(function: Callable[[], object], device: str) -> float:
 
 @dataclass(frozen=True)
 class Exact:
-    """Answers in float64, to some prompts on the first crop."""
+    """Answers in float64 to some prompts on the first crop."""
 
     embedding: Tensor
     points: Tensor
@@ -48,11 +48,11 @@ class Exact:
         return cls(embedding, points, found.pred_masks[0])
 
     def encoder_error(self, network: SamNetwork, pixels: Tensor) -> float:
-        """Length of the error of an embedding over its length."""
+        """Return the norm of the error of an embedding, relative to its norm."""
         return float((network.embed(pixels[:1])[0] - self.embedding).norm() / self.embedding.norm())
 
     def decoder_error(self, network: SamNetwork) -> float:
-        """The same of logits, for the exact embedding."""
+        """Return the same error of the logits for the exact embedding."""
         found = SamNetwork.decode(network, self.embedding.float(), self.points)[0]
         return float((found.double() - self.logits).norm() / self.logits.norm())
 
@@ -66,7 +66,7 @@ def decode_all(network: SamNetwork, embeddings: list[Tensor], points: Tensor) ->
 def add_networks(
     report: Report, model: Any, pixels: Tensor, points: Tensor, device: str, exact: Exact, variants: bool
 ) -> None:
-    """Times of the network in other precisions."""
+    """Add the times of the network in float32 or, with `variants`, in all precisions."""
     precisions: list[SamPrecision] = ["float32", "float16", "bfloat16"]
     for precision in precisions if variants else precisions[:1]:
         network = SamNetwork(model, device, precision)
@@ -87,7 +87,7 @@ def add_networks(
 
 @contextmanager
 def going_on(name: str, foreign: bool) -> Iterator[None]:
-    """Compilers raise whatever they like where they do not work; the rest of the benchmark does without them."""
+    """Print exceptions of compilers, which can raise any exception, so that the benchmark continues without them."""
     try:
         yield
     except Exception as error:
@@ -99,7 +99,7 @@ def going_on(name: str, foreign: bool) -> Iterator[None]:
 def add_encoder(
     report: Report, model: Any, pixels: Tensor, device: str, exact: Exact, name: str, half: bool, compiled: bool
 ) -> None:
-    """Time of the image encoder with weights and residuals in float16 or without, compiled or not."""
+    """Add the time of the image encoder, with or without weights and residuals in float16, compiled or not."""
     encoder = copy.deepcopy(model.vision_encoder)
     encoder = encoder.half() if half else encoder
     run = torch.compile(encoder, dynamic=False) if compiled else encoder

@@ -1,7 +1,7 @@
-"""What SAM 2 costs: its network and the rules on its masks, for the table of `research.front_ends`.
+"""Times of SAM 2's network and of the rules on its masks, for the table of `research.front_ends`.
 
-SAM 2.1 large at its real size, with random weights. As for SAM, answers are replaced by blobs once the network has
-given them, so that the rules have masks to work on.
+The network is SAM 2.1 large at its real size with random weights. As for SAM, its answers are replaced by blobs, so
+that the rules have masks to process.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LARGE = {
     "global_attention_blocks": [23, 33, 43],
     "window_positional_embedding_background_size": [7, 7],
 }
-"""The image encoder of facebook/sam2.1-hiera-large."""
+"""Configuration of the image encoder of facebook/sam2.1-hiera-large."""
 LITTLE = {
     "hidden_size": 8,
     "blocks_per_stage": [1, 1, 2, 1],
@@ -40,7 +40,7 @@ LITTLE = {
 
 
 class InjectedSam2(Sam2Network):
-    """The network, whose answers are then replaced by those of `Injected`, made once."""
+    """A network whose answers are replaced by those of `Injected`, which are made once."""
 
     def __init__(self, model: Any, device: str, precision: Any) -> None:
         super().__init__(model, device, precision)
@@ -60,7 +60,7 @@ class InjectedSam2(Sam2Network):
 
 
 def random_sam2(size: Size, device: str) -> Any:
-    """SAM 2.1 large with random weights; a little one for `SMALL`."""
+    """Return SAM 2.1 large with random weights, or a small network for `SMALL`."""
     side, backbone = size.vision[3], LITTLE if size == SMALL else LARGE
     vision = {
         "backbone_config": {"model_type": "sam2_hiera_det_model", "image_size": [side, side], **backbone},
@@ -76,7 +76,7 @@ def random_sam2(size: Size, device: str) -> Any:
 
 @torch.no_grad()
 def add_sam2(report: Report, size: Size, image: Tensor, device: str) -> None:
-    """Adds seconds per image of the network and of all of it, each with its error against float64."""
+    """Add the seconds per image of the network and of the whole segmentation, each with its error against float64."""
     model = random_sam2(size, device)
     network = InjectedSam2(model, device, "auto")
     crops = crop_boxes(size.height, size.width, MaskRules().crop_overlap)

@@ -1,14 +1,13 @@
-"""What seeing the images costs: SAM's network, the rules on its masks, CLIP and SigLIP 2 on their crops and in patches;
-SAM 2.
+"""Times of the front ends: SAM's network, the rules on its masks, CLIP and SigLIP 2 on their crops and in patches, SAM
+2.
 
-All networks have random weights. Masks are injected: cells of a power diagram, whose areas spread as those of objects
-do, each grown over its neighbours; for the suppression three in ten are replaced by near copies of others. Images are
-looked at once before anything is timed, but for `cold_50_s`: 50 images in a process of its own, whose caches of
-compiled kernels are empty.
+All networks have random weights. Masks are injected: cells of a power diagram, whose areas vary like those of objects,
+each enlarged over its neighbors. For the suppression, three in ten are replaced by near copies of others. Each time is
+measured after a warm-up run, except `cold_50_s`: 50 images in a separate process with empty caches of compiled kernels.
 
     python -m research.front_ends               SAM ViT-H and CLIP ViT-B-16, images of 988 x 731
-    python -m research.front_ends --quick       small networks and images, which runs anywhere
-    python -m research.front_ends --variants    also other precisions, compiled encoders, and where kernels spend time
+    python -m research.front_ends --quick       small networks and images, for any machine
+    python -m research.front_ends --variants    also other precisions, compiled encoders, and a profile of kernels
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ from research.report import RESULTS, Report
 
 @contextmanager
 def stopwatch(owner: Any, name: str, device: str) -> Iterator[list[float]]:
-    """Collects the seconds of every call of a function while it lasts."""
+    """Collect the seconds of every call of a function inside the context."""
     function, times = getattr(owner, name), []
 
     @wraps(function)
@@ -77,7 +76,7 @@ def stopwatch(owner: Any, name: str, device: str) -> Iterator[list[float]]:
 
 
 def disagreements(masks: Tensor, scores: Tensor) -> float:
-    """Share of masks on which the suppression and the same rules, pair by pair in float64, disagree."""
+    """Return the share of masks on which `mask_nms` and the same rules, pair by pair in float64, disagree."""
     flat = masks.flatten(1).double()
     both, area = (flat @ flat.T).tolist(), flat.sum(dim=1).tolist()
     rules, values = Suppression(), scores.tolist()
@@ -94,7 +93,7 @@ def disagreements(masks: Tensor, scores: Tensor) -> float:
 
 
 def changed_pixels(found: Tensor, exact: Tensor) -> float:
-    """Share of pixels outside of the region of an exact label map that shares most with their own."""
+    """Return the share of pixels outside the region of an exact label map that overlaps most with their region."""
     pairs = torch.stack([found.flatten(), exact.flatten()]).long().cpu() + 1
     shared = torch.zeros(*(int(line.max()) + 1 for line in pairs))
     shared.index_put_(tuple(pairs), torch.ones(pairs.shape[1]), accumulate=True)
@@ -103,7 +102,7 @@ def changed_pixels(found: Tensor, exact: Tensor) -> float:
 
 @contextmanager
 def plain() -> Iterator[None]:
-    """Masks are made before they are measured."""
+    """Context in which masks are enlarged in memory before they are measured."""
     kernels_apply = network_module.can_use_triton
     network_module.can_use_triton = lambda tensor: False
     try:
@@ -113,7 +112,7 @@ def plain() -> Iterator[None]:
 
 
 def cold(size: Size, device: str) -> None:
-    """Prints the seconds of some images, the first of this process; networks are there."""
+    """Print the seconds of the first images of this process, with loaded networks."""
     g = torch.Generator().manual_seed(0)
     model = random_sam(size, device)
     with tempfile.TemporaryDirectory() as folder:
@@ -129,7 +128,7 @@ def cold(size: Size, device: str) -> None:
 
 
 def cold_seconds(quick: bool, device: str) -> tuple[float, float]:
-    """Of a process of its own without compiled kernels: of all images, and until the first is done."""
+    """Return the seconds of a new process without compiled kernels: for all images, and for the first."""
     with tempfile.TemporaryDirectory() as folder:
         caches = {name: f"{folder}/{name}" for name in ("TRITON_CACHE_DIR", "TORCHINDUCTOR_CACHE_DIR")}
         command = [sys.executable, "-m", "research.front_ends", "--cold", "--device", device]
@@ -142,7 +141,7 @@ def cold_seconds(quick: bool, device: str) -> tuple[float, float]:
 
 
 def print_profile(function: Callable[[], object], device: str) -> None:
-    """Where kernels spend the time of one call."""
+    """Print the time of each kernel in one call."""
     kinds = [torch.profiler.ProfilerActivity.CPU]
     kinds += [torch.profiler.ProfilerActivity.CUDA] * device.startswith("cuda")
     with torch.profiler.profile(activities=kinds) as profile:
@@ -166,7 +165,7 @@ STEPS = {
 
 
 def add_siglip2(report: Report, size: Size, image: Tensor, g: torch.Generator, device: str) -> None:
-    """SigLIP 2 base on the crops of masks and in patches; errors are those against float32 on the CPU."""
+    """Add SigLIP 2 base on crops of masks and in patches; errors are relative to float32 on the CPU."""
     with tempfile.TemporaryDirectory() as folder:
         encoder = random_siglip2(size, Path(folder), device)
         exact = replace(encoder, device="cpu")
@@ -271,7 +270,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small networks and images")
     parser.add_argument("--variants", action="store_true", help="other precisions, compiled encoders, a profile")
-    parser.add_argument("--cold", action="store_true", help="only some images in this process, which are timed")
+    parser.add_argument("--cold", action="store_true", help="only time some images in this process")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     arguments = parser.parse_args()

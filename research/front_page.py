@@ -1,9 +1,9 @@
-"""docs/demo.png: a question to the demo room, its answer from spoiled masks, its reliability, and the repaired answer.
+"""docs/demo.png: a query of the demo room, its answer from damaged masks, its reliability, and the repaired answer.
 
 python -m research.front_page
 
-The masks are those of step "wrong classes" of the ladder of damage, with seed 0: a third of them name another class.
-What masks are called are made vectors, as near to each other as those of CLIP's texts.
+The masks are those of step "wrong classes" of the ladder of damage, with seed 0: about a third of them have another
+class. The features of masks are made of vectors that are as similar to each other as those of CLIP's texts.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from research.variants import Scores, lifted_scores, refined_scores
 STEP, SEED, VIEW = "wrong classes", 0, 3
 ASKED = "tomato red"
 FOUND = torch.tensor([0.95, 0.2, 0.1])
-"""RGB of what is found; the rest is grey."""
+"""RGB color of selected Gaussians; the rest is gray."""
 LOWEST, HIGHEST = 0.55, 0.85
-"""Ends of the colours of R."""
+"""Ends of the color scale of R."""
 
 
 def main() -> None:
@@ -73,18 +73,18 @@ def main() -> None:
 
 
 def shown(world: World, values: Tensor) -> Tensor:
-    """[H, W, C] values of the Gaussians as the view shows them."""
+    """Return [H, W, C], values of the Gaussians rendered in the view."""
     return render(world.scene, world.held_out[VIEW], values)[0].clamp(0, 1)
 
 
 def overlay(world: World, photo: Tensor, scores: Scores, asked: int) -> Tensor:
-    """[H, W, 3] the view in grey; Gaussians that are nearest to the class that is asked for are coloured."""
+    """Return [H, W, 3], the view in gray with the Gaussians that are nearest to the class `asked` in color."""
     found = shown(world, (scores.cosine.argmax(dim=1) == asked).float()[:, None])
     return (0.6 * photo.mean(dim=-1, keepdim=True) + 0.25) * (1 - found) + FOUND * found
 
 
 def iou(world: World, scores: Scores, asked: int) -> float:
-    """Over the Gaussians whose class is known."""
+    """Return the IoU over the Gaussians with a known class."""
     known = world.truth >= 0
     return mask_iou((scores.cosine.argmax(dim=1) == asked)[known], (world.truth == asked)[known])
 

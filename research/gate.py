@@ -1,45 +1,47 @@
-"""Gates of the vote and ways to abstain, on the frozen grid: gains, edges, answers mended and broken.
+"""Gates of the vote and conditions for keeping a direction, on the frozen grid: gains, edges, corrected and lost
+answers.
 
     python -m research.gate --workers 12                all scenes; for a GPU
     python -m research.gate --later --workers 12        the candidates of the second study
     python -m research.gate --quick                     a small room and three cells, for the tests
 
-The second study, with its rule, is "The vote after a consensus" in research/studies.md. The rest is about the first.
+The second study, with its rule, is "The vote after a consensus" in research/studies.md. The rest of this text describes
+the first.
 
 Every form votes after the consensus with the posterior vote. Its gate is fixed (tau, gamma) or relative (see
-`core.refine.relative_gate`). It may abstain, so that a Gaussian keeps its direction:
+`core.refine.relative_gate`). Conditions can make a Gaussian keep its direction:
 
-* delta: the winner must lead by this much, in units of R times views (equation 10);
-* quorum: neighbors of this share of the weight must agree with the winner; P g(1) is full agreement;
+* delta: the winner must lead by this number, in units of R times views (equation 10);
+* quorum: neighbors with this share of the weight must agree with the winner; P g(1) is full agreement;
 * margin: the winner must lead by this share of P g(1), before the outer factor R_j;
-* low: R_i must be below this multiple of the neighbors' mean R, weighted by distance;
+* low: R_i must be below this multiple of the mean R of the neighbors, weighted by distance;
 * seen: this share of the Gaussian's weight in all pixels must lie in regions, unless no view shows it at all.
 
-Rule, written before any run on the grid. Tabletop and plain room choose; the second and third room confirm. A cell is
-the mean over 4 seeds. For every form, count which of these targets it meets on the cells of masks, statistic real
-included:
+This rule was written before any run on the grid. Tabletop and plain room choose; the second and third room confirm. A
+cell is the mean over 4 seeds. For each form, the rule counts the targets that it meets on the cells of masks, including
+statistic real:
 
-1. damaged, all views: mean gain over the lift alone at least that of today's gate (.9, .05) less 0.3 points;
+1. damaged, all views: mean gain over the lift alone at least that of today's gate (.9, .05) minus 0.3 points;
 2. edges (over a tenth of the neighbors are of other classes): accuracy, mean over cells, at least that of the
-   consensus alone less 1.0 points;
-3. worst cell against the lift alone: -0.7 with all views, -2 with 6, -2.5 with 3 (three targets);
+   consensus alone minus 1.0 points;
+3. worst cell compared with the lift alone: -0.7 with all views, -2 with 6, -2.5 with 3 (three targets);
 4. undamaged, all views: no cell loses more than 0.05 points;
-5. answers mended against broken by the vote, summed over cells: 2 : 1 for CLIP-like texts and 3 : 1 for orthogonal
-   ones (two targets), with at least half as many mended in damaged cells as today (one target).
+5. corrected answers to answers lost by the vote, summed over cells: 2 : 1 for CLIP-like texts and 3 : 1 for orthogonal
+   ones (two targets), with at least half as many corrected in damaged cells as today (one target).
 
-The default is the form that meets the most targets. Of equal ones, the one with the larger mean gain of target 1 wins.
-A form that fails target 1 by more than 1 point is not eligible. If in the other rooms the chosen form is worse than
-today's gate in the mean gain of target 1 by more than 0.3 points, today's gate stays.
+The default is the form that meets the most targets. Among equal ones, the larger mean gain of target 1 wins. A form
+that misses target 1 by more than 1 point is not eligible. Today's gate stays if, in the other rooms, the mean gain of
+target 1 of the chosen form is more than 0.3 points below that of today's gate.
 
-History. A first run had four seeds of most CLIP-like and isotropic cells, with more forms: not copying directions of
-cosine .98 or more (`same`) lost 0.9 points, and larger values of every way to abstain lost more than they saved. In
-cells of 3 views with dropped masks the vote fills Gaussians whose things have no mask; `seen` was added after that.
+History. A first run had four seeds of most CLIP-like and isotropic cells, with more forms. Not copying directions with
+a cosine of .98 or more (`same`) lost 0.9 points, and larger values of each condition lost more than they saved. In
+cells of 3 views with dropped masks, the vote fills Gaussians of objects without a mask; `seen` was added after that.
 
 Reliabilities are measured in the same run, on the answers after the consensus: the area under the ROC curve of being
-right, the accuracy in tenths by R and the mean R of each tenth. Four forms: R of the paper (`paper`), R of the paper
-with N of `core.reliability` (`views`), its R with N_eff (`pairs`), and its R (`angular`). Rule: the better form has
-the larger mean AUC over the cells of masks of tabletop and plain room, and is nowhere worse than the paper's by more
-than 0.01 in the mean of a damage or a number of views; otherwise the paper's stays the default.
+correct, the accuracy in tenths by R, and the mean R of each tenth. There are four forms: R of the paper (`paper`), R of
+the paper with N of `core.reliability` (`views`), its R with N_eff (`pairs`), and its R (`angular`). The better form has
+the larger mean AUC over the cells of masks of tabletop and plain room. It must not be worse than the paper's by more
+than 0.01 in the mean of a damage or a number of views; otherwise, the paper's stays the default.
 """
 
 from __future__ import annotations
@@ -77,33 +79,34 @@ from research.rule import CHOICE, CONFIRMATION, SEEDS, Cell, cells_of, real_cell
 from research.variants import lifted_scores
 
 EDGE, CHANGED = 0.1, 0.98
-"""Share of neighbors of other classes at an edge; cosine to the own direction below which it has changed."""
+"""Share of neighbors of other classes at an edge, and cosine to the previous direction below which it counts as
+changed."""
 
 
 @dataclass(frozen=True)
 class Form:
-    """A gate and a way to abstain."""
+    """A gate and conditions under which a Gaussian keeps its direction."""
 
     tau: float | None = None
-    """None: relative, as gamma."""
+    """tau of a fixed gate, or None for a relative gate."""
     gamma: float = 0.05
     delta: float = 0.0
     quorum: float = 0.0
     margin: float = 0.0
     low: float = 0.0
-    """0: off."""
+    """0 disables the condition."""
     seen: float = 0.0
     forced: bool = False
-    """The consensus runs at full strength."""
+    """True if the consensus runs at full strength."""
     quantile: float = 0.05
-    """Of the relative gate."""
+    """Quantile of the relative gate."""
     local: bool = False
-    """Every Gaussian has a relative gate of its own."""
+    """True if every Gaussian has its own relative gate."""
     shared: float = 0.0
-    """Only neighbors vote that share a region in this share of the views that see both; `ANY`: in any view."""
+    """Only neighbors vote that share a region in this share of the views that show both; `ANY`: in any view."""
     gated: bool = True
     few: float = 0.0
-    """Only Gaussians whose own evidence is below this number of views may change; `NONE`: those without direction."""
+    """Only Gaussians with evidence below this number of views can change; `NONE`: only those without a direction."""
 
     @property
     def name(self) -> str:
@@ -117,10 +120,10 @@ class Form:
 KEYS = ("delta", "quorum", "margin", "low", "seen", "shared", "few")
 ANY, NONE = 1e-3, 1e-6
 LEAST = 4
-"""Smallest number of neighbors that share the region for a gate of one's own."""
+"""Smallest number of neighbors that share the region of a Gaussian with a relative gate of its own."""
 TODAY = Form(0.9, 0.05)
 DEFAULT = Form(seen=0.2, forced=True)
-"""What the rule chose, for masks."""
+"""Form that the rule chose for masks."""
 GATES = (TODAY, Form(0.98, 0.01), Form())
 FORMS = (
     *GATES,
@@ -133,7 +136,7 @@ FORMS = (
     *(replace(gate, forced=True) for gate in (TODAY, Form(), Form(seen=0.2))),
 )
 PIECES = replace(TODAY, seen=0.2)
-"""The default for pieces of pictures, whose consensus stays off."""
+"""Default for pieces of images, for which the consensus is off."""
 LATER = (
     TODAY,
     DEFAULT,
@@ -149,7 +152,7 @@ LATER = (
 
 
 def gate_of(form: Form, cosines: Tensor) -> tuple[float, float]:
-    """tau and gamma; today's where the relative gate cannot be measured."""
+    """Return tau and gamma. If the relative gate cannot be measured, they are those of `TODAY`."""
     if not form.gated:
         return -1.0, 0.05
     if form.tau is not None:
@@ -158,7 +161,7 @@ def gate_of(form: Form, cosines: Tensor) -> tuple[float, float]:
 
 
 def local_gate(part: Any, form: Form, together: Tensor, default: float) -> tuple[Tensor, Tensor]:
-    """[m, 1, 1] tau and gamma of every voter, from the neighbors that share its region."""
+    """Return [m, 1, 1] tau and gamma of every voter, from the neighbors that share its region."""
     cosine = part.gram[:, 0, 1:].float().masked_fill(~together, torch.inf).sort(1).values
     count = together.sum(1)
     place = (form.quantile * (count - 1).clamp(min=0)).long()
@@ -169,10 +172,11 @@ def local_gate(part: Any, form: Form, together: Tensor, default: float) -> tuple
 def decided(
     part: Any, gate: tuple[float, float], forms: Sequence[Form], labeled: Tensor, views: tuple[Tensor, Tensor]
 ) -> list[tuple[Tensor, Tensor]]:
-    """[m] place in N+ whose direction is taken, and cosine with the own one, by forms of the same gate.
+    """Return, for forms of the same gate, [m] the position in N+ of the direction used, and its cosine with the
+    previous one.
 
     Args:
-        views: [m, K] numbers of views in which a neighbor shares the region, and that see both.
+        views: [m, K] numbers of views in which a neighbor shares the region, and of views that show both.
     """
     whole = decided_among(part, gate, [form for form in forms if not form.shared and not form.local], labeled)
     found = []
@@ -190,14 +194,14 @@ def decided(
 
 
 def voted(part: Any, near: Tensor) -> Any:
-    """The part with those neighbors alone; voters without a direction keep all."""
+    """Return the part with only the neighbors `near`; voters without a direction keep all neighbors."""
     kept = torch.nn.functional.pad(near | (part.norm[:, :1] == 0), (1, 0), value=True)
     norm, n_eff = (torch.where(kept, x, 0.0) for x in (part.norm, part.n_eff))
     return replace(part, norm=norm, n_eff=n_eff)
 
 
 def decided_among(part: Any, gate: tuple[Any, Any], forms: Sequence[Form], labeled: Tensor) -> Iterator[Any]:
-    """As `decided`, among all neighbors that are reliable."""
+    """Yield the results of `decided` among all reliable neighbors."""
     if len(forms) == 0:
         return
     tau, gamma = gate
@@ -229,7 +233,7 @@ def decided_among(part: Any, gate: tuple[Any, Any], forms: Sequence[Form], label
 
 
 def measured_cosines(lifted: Lifted, voters: Voters) -> Tensor:
-    """The cosines of the relative gate, from a neighbor of each of at most 20,000 voters."""
+    """Return the cosines for the relative gate, from a neighbor of each of at most 20,000 voters."""
     own = voters.group[:, 0]
     slot = (hash_to_unit(own) * (voters.group.shape[1] - 1)).long() + 1
     other = voters.group.gather(1, slot[:, None]).squeeze(1)
@@ -238,7 +242,8 @@ def measured_cosines(lifted: Lifted, voters: Voters) -> Tensor:
 
 
 def neighbor_views(evidence: Evidence, group: Tensor) -> tuple[Tensor, Tensor]:
-    """[m, K] numbers of views in which a neighbor shares the region of the voter, and that see both."""
+    """Return [m, K] numbers of views in which a neighbor shares the region of the voter, and of views that show
+    both."""
     there = group[:, 1:] >= 0
     own = group[:, :1].expand_as(there)[there]
     together, both = (torch.zeros(there.shape, dtype=torch.float32, device=group.device) for _ in range(2))
@@ -250,7 +255,10 @@ def neighbor_views(evidence: Evidence, group: Tensor) -> tuple[Tensor, Tensor]:
 def agreed_lifts(
     evidence: Evidence, features: Tensor, seen: Lifted, *, judge: bool
 ) -> tuple[dict[bool, Lifted], float, dict[str, list[float]]]:
-    """The lifts after the consensus by its ramp and at full strength, with R of before; B; left-out views."""
+    """Return the lifts after the consensus, B, and figures of left-out views.
+
+    The lifts are those with the ramp of the consensus (False) and at full strength (True), with R from before it.
+    """
     chosen, chance = sample_gaussians(evidence.rows, evidence.num_regions, SAMPLE)
     rows, total = evidence.rows.select_rows(chosen), total_view_weights(evidence.select_gaussians(chosen))
     overlaps = region_overlaps(rows, evidence.region_view, chance, total)
@@ -266,7 +274,7 @@ def agreed_lifts(
 
 
 def reliabilities(site: Site, observed: Any, seen: Lifted) -> dict[str, Tensor]:
-    """[M] every form of R of the voters."""
+    """Return [M], every form of R of the voters."""
     own, cameras = site.voters.group[:, 0], [site.world.cameras[i] for i in observed.views]
     centers = torch.stack([camera.world_to_camera.double().cpu().inverse()[:3, 3] for camera in cameras])
     means = site.world.scene.means if site.kept is None else site.world.scene.means[site.kept]
@@ -284,7 +292,7 @@ def reliabilities(site: Site, observed: Any, seen: Lifted) -> dict[str, Tensor]:
 
 
 def ranked(key: Tensor, right: Tensor) -> dict[str, Any]:
-    """AUC of being right, and accuracy and mean of ten bins by ascending key, of what has evidence."""
+    """Return the AUC of being correct, and accuracy and mean of ten bins by ascending key, for keys above 0."""
     there = key > 0
     key, right = key[there], right[there].double()
     if len(key) < 10 or not 0 < float(right.mean()) < 1:
@@ -299,7 +307,7 @@ def ranked(key: Tensor, right: Tensor) -> dict[str, Any]:
 
 
 def edge_of(site: Site, voters: Voters) -> Tensor:
-    """[M] whether a voter is at an edge."""
+    """Return [M], True if a voter is at an edge."""
     truth = site.world.truth if site.kept is None else site.world.truth[site.kept]
     near = torch.where(voters.group[:, 1:] >= 0, truth[voters.group[:, 1:].clamp(min=0)], -1)
     other = (near >= 0) & (near != voters.truth[:, None])
@@ -309,7 +317,7 @@ def edge_of(site: Site, voters: Voters) -> Tensor:
 def observed_forms(
     site: Site, cell: Cell, seed: int, all_forms: Sequence[Form] = FORMS, *, judge: bool = False
 ) -> dict[str, Any]:
-    """Everything of one observation; with left-out views if asked for."""
+    """Return all figures of one observation; with left-out views if `judge` is True."""
     observed = site.observed(cell, seed)
     words = site.looks if cell.statistic == "histogram" else site.words[cell.statistic]
     classes, voters = words.classes.to(observed.features.device), site.voters
@@ -373,7 +381,7 @@ def observed_forms(
 
 @lru_cache(maxsize=1)
 def site_of(place: Place, settings: Settings) -> Site:
-    """The place of the last cell is kept."""
+    """Return the site of a place; the last one is cached."""
     return Site(place, settings)
 
 
@@ -387,7 +395,7 @@ def run_cells(
     judge: bool,
     later: bool,
 ) -> None:
-    """Cells of one place; of pieces of the picture with the first seed alone."""
+    """Run cells of one place; pieces of images use only the first seed."""
     for cell in cells:
         for seed in seeds if cell.kind == "masks" else seeds[:1]:
             if time.time() > deadline:
@@ -438,10 +446,10 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", type=int, default=len(SEEDS))
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--chunk", type=int, default=18, help="cells that a process takes at a time")
-    parser.add_argument("--minutes", type=float, default=1e6, help="no observation begins later than this")
+    parser.add_argument("--minutes", type=float, default=1e6, help="minutes after which no observation starts")
     parser.add_argument("--judge", action="store_true", help="measure the recognition of left-out views too")
-    parser.add_argument("--statistics", nargs="+", help="cells of these statistics alone")
-    parser.add_argument("--later", action="store_true", help="the candidates of the second study")
+    parser.add_argument("--statistics", nargs="+", help="run only cells of these statistics")
+    parser.add_argument("--later", action="store_true", help="run the candidates of the second study")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--rows", type=Path, default=RESULTS / "gate_rows.jsonl", help="finished observations")
     main(parser.parse_args())

@@ -1,6 +1,6 @@
-"""The figures of `research.gate --later`, from its rows, and the targets of its first rule.
+"""Figures of `research.gate --later` from its rows, and the targets of its first rule.
 
-python -m research.gate_report            prints tables; results/gate.json
+python -m research.gate_report            prints tables; results/gate.json with --output
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from research.rule import CHOICE, CONFIRMATION, REAL, Cell
 Row = dict[str, Any]
 Cells = Mapping[Cell, Sequence[Row]]
 FRONT_ENDS = {"masks": DEFAULT, "patches": PIECES, "superpixels": PIECES, "grid": PIECES}
-"""The default by kind of region."""
+"""Default form by kind of region."""
 WORST = {"all": 0.7, "6": 2.0, "3": 2.5}
-"""Largest loss of a cell, points."""
+"""Largest accepted loss of a cell in percentage points, by number of views."""
 
 
 def cells_of_rows(rows: Sequence[Row]) -> dict[Cell, list[Row]]:
-    """Rows by cell, of masks alone."""
+    """Return the rows of cells of masks, by cell."""
     found: dict[Cell, list[Row]] = {}
     for row in rows:
         cell = Cell(*row["cell"])
@@ -36,7 +36,8 @@ def cells_of_rows(rows: Sequence[Row]) -> dict[Cell, list[Row]]:
 
 
 def by_kind(rows: Sequence[Row]) -> dict[str, list[float]]:
-    """Gains of the default over the lift alone in all cells of a kind of region; statistic real is one of its own."""
+    """Return the gains of the default over the lift alone in all cells, by kind of region. Statistic real is a separate
+    kind."""
     cells: dict[Cell, list[Row]] = {}
     for row in rows:
         cells.setdefault(Cell(*row["cell"]), []).append(row)
@@ -48,7 +49,7 @@ def by_kind(rows: Sequence[Row]) -> dict[str, list[float]]:
 
 
 def value(rows: Sequence[Row], key: str, name: str, base: str | None = None) -> float:
-    """Mean over the seeds of a cell, less that of another form."""
+    """Return the mean over the seeds of a cell, minus that of the form `base` if it is given."""
     at, other = rows[0]["names"].index(name), None if base is None else rows[0]["names"].index(base)
     return mean(row[key][at] - (0 if other is None else row[key][other]) for row in rows)
 
@@ -64,7 +65,7 @@ def ratio(cells: Cells, name: str, statistic: str) -> float:
 
 
 def measures(cells: Cells, name: str) -> dict[str, float]:
-    """What the rule reads of a form."""
+    """Return the figures of a form that the rule uses."""
     base = "forced consensus" if name.startswith("forced") else "consensus"
     damaged = lambda cell: cell.damage != "noise only"  # noqa: E731
     found = {
@@ -91,7 +92,7 @@ def measures(cells: Cells, name: str) -> dict[str, float]:
 
 
 def targets(found: Mapping[str, float], today: Mapping[str, float]) -> dict[str, bool]:
-    """Which targets of the rule a form meets."""
+    """Return, for each target of the rule, whether a form meets it."""
     return {
         "damaged": found["damaged"] >= today["damaged"] - 0.3,
         "edges": found["edges"] >= -1.0,
@@ -104,7 +105,7 @@ def targets(found: Mapping[str, float], today: Mapping[str, float]) -> dict[str,
 
 
 def table(cells: Cells) -> dict[str, dict[str, float]]:
-    """Measures of all forms, and the number of targets that each meets."""
+    """Return the measures of all forms, and the number of targets that each meets."""
     names = next(iter(cells.values()))[0]["names"]
     found = {name: measures(cells, name) for name in names if name != "lift"}
     for one in found.values():
@@ -113,7 +114,11 @@ def table(cells: Cells) -> dict[str, dict[str, float]]:
 
 
 def reliabilities(cells: Cells) -> dict[str, dict[str, float]]:
-    """AUC, accuracy of the highest tenth in the worst cell, and the worst mean of a column against the paper's R."""
+    """Return figures of each form of R.
+
+    They are its AUC, the accuracy of its highest tenth in the worst cell, and its worst mean gain over the paper's R in
+    a column.
+    """
     found: dict[str, dict[str, float]] = {}
     kinds = next(iter(cells.values()))[0]["R"]
     auc = {cell: {kind: [row["R"][kind]["auc"] for row in rows] for kind in kinds} for cell, rows in cells.items()}

@@ -1,4 +1,4 @@
-"""Geometry of real features: cosines between regions of lifted captures, the source of the "real" statistic.
+"""Cosines between regions of lifted captures, from which the statistic "real" of features is derived.
 
     python -m research.geometry fox=RUN/config.yml tabletop=RUN/config.yml    results/geometry.json
 
@@ -6,11 +6,12 @@ The runs are those of `ns-normlift --encoder imagenet --regions edges`. In each 
 with most of its weight, if that is at least half. Objects are the labels of the fox (`cut.label_masks`), or the exact
 masks of the tabletop. A Gaussian belongs to the label with three quarters of its weight in the labeled images.
 
-Keys: <capture>.drift.<degrees>, the cosine between the features of one Gaussian in two views that far apart;
-<capture>.<label>.… and <capture>.thing.…, between two Gaussians of one object; <capture>.two_things.…, of two objects;
-<capture>.agreement, the B of its regions, also for small rooms with this statistic. If the encoder knows the
-word for an object: its cosine with its own prompt (own), with the best of 11 other names (wrong), the share of views in
-which any of the 1,000 names beats its own (wins), and the spread of the lifted cosines.
+Keys: <capture>.drift.<degrees>, the cosine between the features of one Gaussian in two views with this angle between
+them; <capture>.<label>.… and <capture>.thing.…, between two Gaussians of one object; <capture>.two_things.…, of two
+objects; <capture>.agreement, the B of its regions, also for small rooms with this statistic. If the encoder knows the
+word for an object, further keys have its cosine with its own prompt (own) and with the best of 11 other names (wrong).
+They also have the share of views in which any of the 1,000 names exceeds its own (wins), and the spread of the lifted
+cosines.
 """
 
 from __future__ import annotations
@@ -46,13 +47,13 @@ from research.synthetic_scenes import PURITY, WEIGHT, demo
 from tests.captures import SHARED
 
 BINS = (0, 3, 6, 10, 20, 30, 60, 180)
-"""Degrees between two views."""
+"""Bounds of the bins of the angle between two views, in degrees."""
 SAMPLE, PAIRS, FEWEST = 6000, 200_000, 100
-"""Gaussians and pairs of Gaussians that are looked at, and pairs of views that a bin needs."""
+"""Number of Gaussians and of pairs of Gaussians in samples, and smallest number of pairs of views in a bin."""
 WORDS = {"fox": "red fox", "fox head": "red fox", "shield": "shield"}
 TEXT_UNITS = {"wins": "share of views of Gaussians", "one_name": "share of these", "spread": "of the median"}
 OTHERS = 11
-"""Names that are asked for beside the right one, as many as the tabletop has."""
+"""Number of other names that are compared with the right one, as many as the tabletop has."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +61,15 @@ class Seen:
     """Gaussians and the features of their regions."""
 
     home: Tensor
-    """[N, V] region that a Gaussian lies in, -1 for none."""
+    """[N, V] region of each Gaussian in each view, or -1 for none."""
     features: Tensor
-    """[S, D] unit."""
+    """[S, D] unit rows."""
     toward: Tensor
-    """[N, V, 3] unit, from the Gaussian to the camera."""
+    """[N, V, 3] unit vectors from the Gaussian to the camera."""
 
     @staticmethod
     def of(evidence: Evidence, features: Tensor, means: Tensor, cameras: Sequence[Camera]) -> Seen:
-        """Where the Gaussians of a lift lie."""
+        """Return the regions of the Gaussians of a lift."""
         rows, views = evidence.rows, evidence.num_views
         place = rows.row_index() * views + evidence.region_view[rows.column.long()].long()
         total = torch.zeros(len(rows) * views).index_add_(0, place, rows.weight)
@@ -80,7 +81,8 @@ class Seen:
         return Seen(home.view(-1, views), features, normalize(eyes - means[:, None], dim=2))
 
     def drift(self, some: Tensor) -> dict[str, tuple[float, float]]:
-        """Mean cosine of the features of one Gaussian in two views, and mean angle, by bins of the angle."""
+        """Return the mean cosine of the features of one Gaussian in two views, and the mean angle, by bins of the
+        angle."""
         bounds, views = torch.tensor(BINS[1:-1]).float(), self.home.shape[1]
         sums, counts, angles = torch.zeros(3, len(BINS) - 1, dtype=torch.float64)
         for part in some.split(500):
@@ -96,7 +98,7 @@ class Seen:
         return {f"{low}-{high}": (x, angle) for (low, high), x, angle, n in values if n >= FEWEST}
 
     def pairs(self, some: Tensor, others: Tensor, g: torch.Generator, *, one_view: bool) -> float:
-        """Mean cosine of random pairs of different Gaussians that lie in different regions."""
+        """Return the mean cosine of random pairs of different Gaussians in different regions."""
         i, j = (x[torch.randint(0, len(x), (PAIRS,), generator=g)] for x in (some, others))
         v, u = torch.randint(0, self.home.shape[1], (2, PAIRS), generator=g)
         p, q = self.home[i, v], self.home[j, v if one_view else u]
@@ -106,7 +108,10 @@ class Seen:
 
 
 def geometry(seen: Seen, things: Mapping[str, Tensor], g: torch.Generator) -> dict[str, float]:
-    """All cosines but those with texts, and the curve far + (near - far) exp(-angle / scale) through the drift."""
+    """Return all cosines except those with texts, and the parameters of a curve through the drift.
+
+    The curve is far + (near - far) exp(-angle / scale).
+    """
     known = (seen.home >= 0).sum(1) >= 3
     curve = seen.drift(_sample(known.nonzero().squeeze(1), g))
     found = {f"drift.{key}": cosine for key, (cosine, _) in curve.items()}
@@ -126,7 +131,7 @@ def geometry(seen: Seen, things: Mapping[str, Tensor], g: torch.Generator) -> di
 
 
 def spread(cosines: Tensor) -> float:
-    """A standard deviation by the 5 % and 95 % quantiles, as a share of the median."""
+    """Return a standard deviation estimated from the 5 % and 95 % quantiles, relative to the median."""
     low, middle, high = cosines.float().quantile(torch.tensor([0.05, 0.5, 0.95])).tolist()
     return (high - low) / (2 * 1.645 * middle)
 
@@ -134,10 +139,11 @@ def spread(cosines: Tensor) -> float:
 def text_cosines(
     seen: Seen, lifted: Tensor, some: Tensor, word: str, texts: Tensor, g: torch.Generator
 ) -> dict[str, float]:
-    """Cosines with the text of a thing and with others; texts [1000, D] unit.
+    """Return the cosines of an object with its own text and with others.
 
     Args:
-        lifted: [N, D] unit.
+        lifted: [N, D] unit directions.
+        texts: [1000, D] unit vectors.
     """
     own = find_classes(word)
     home = seen.home[some]
@@ -169,7 +175,8 @@ def _sample(some: Tensor, g: torch.Generator) -> Tensor:
 
 
 def label_maps(capture: str, names: Sequence[str]) -> dict[str, tuple[Tensor, list[str]]]:
-    """Maps [H, W] of some views by the stem of their image, 0 for what has no label, and the names of 1, 2, ..."""
+    """Return maps [H, W] of some views by the stem of their image, 0 for pixels without a label, and the names of 1, 2,
+    ..."""
     if capture == "tabletop":
         folder, things = SHARED / "captures" / "tabletop" / "instance", [str(i) for i in range(1, 13)]
         stems = sorted(Path(name).stem for name in names)[::6]
@@ -184,7 +191,7 @@ def label_maps(capture: str, names: Sequence[str]) -> dict[str, tuple[Tensor, li
 
 
 def things_of(run: Any, capture: str) -> dict[str, Tensor]:
-    """Gaussians of every label."""
+    """Return the Gaussians of every label."""
     scene = run.scene
     cameras = {Path(x.name).stem: x.camera for part in (scene.train, scene.held_out) for x in part}
     maps = label_maps(capture, scene.train.names)

@@ -1,11 +1,11 @@
-"""The whole lift on one GPU: seconds of every stage beside its error, memory, and what stock gsplat needs.
+"""Times, errors and memory of the whole lift on one GPU by stages, compared with stock gsplat.
 
     python -m research.gpu            fox, tabletop, rooms of 0.48, 1.93 and 10 million Gaussians, growth
     python -m research.gpu --quick    fox and tabletop only
     python -m research.gpu --rooms    evidence, lift and RGB of rooms of 1.93 and 10 million Gaussians, by stages
 
-Every time is the median of three runs after a first one, the GPU waited for on both sides. What is compared with stock
-gsplat's RGB render is measured in turns with it, in seven rounds.
+Each time is the median of three runs after a warm-up run, with synchronization of the GPU before and after. Comparisons
+with stock gsplat's RGB render are measured in turns with it, in seven rounds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ GSPLAT_VIEWS = 6
 
 
 def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
-    """The RGB render of all views by stock gsplat, and its backward pass for 512 channels of the first few."""
+    """Return functions for the RGB render of all views by stock gsplat, and for its backward pass with 512 channels.
+
+    The backward pass uses only the first views.
+    """
     from gsplat.cuda._wrapper import (  # noqa: PLC0415
         fully_fused_projection,
         isect_offset_encode,
@@ -70,7 +73,10 @@ def stock_renders(case: Case) -> tuple[Callable[[], None], Callable[[], None]]:
 
 
 def compare_with_rgb(report: Report, case: Case, rounds: int = 7) -> None:
-    """Evidence and lift over stock gsplat's RGB render, in turns: medians, the ends of the ratio, and the error."""
+    """Add the time of evidence and lift relative to stock gsplat's RGB render, measured in turns.
+
+    Metrics are medians, the smallest and largest ratio, and the error.
+    """
 
     def add(key: str, value: Any, unit: str, error: Any = None) -> None:
         report.add(f"{case.name}.{key}", value, unit, error)
@@ -112,7 +118,7 @@ def compare_with_rgb(report: Report, case: Case, rounds: int = 7) -> None:
 
 
 def measure(report: Report, case: Case) -> None:
-    """Adds the metrics NAME.* of a case."""
+    """Add the metrics NAME.* of a case."""
 
     def add(key: str, value: Any, unit: str, error: Any = None) -> None:
         report.add(f"{case.name}.{key}", value, unit, error)
@@ -176,14 +182,14 @@ def measure(report: Report, case: Case) -> None:
 
 
 def query_field(lifted: Lifted, source: torch.Tensor) -> SemanticField:
-    """A field of the exact form without its costly facts (bytes and bounds of the other forms)."""
+    """Return a field of the exact form without its bytes and bounds of the other forms, which take time."""
     return SemanticField(
         lifted.scalars, source, StoredEvidence(lifted.evidence, lifted.features), {"dimension": DIMENSION}
     )
 
 
 def agreement(report: Report, cases: Sequence[Case]) -> None:
-    """How far the kernel is from gsplat's own backward pass, and whether two runs give the same bits."""
+    """Add the differences between the kernel and gsplat's backward pass, and whether two runs agree bit for bit."""
     from gsplat.cuda._wrapper import rasterize_to_pixels  # noqa: PLC0415
 
     worst, alpha_worst, repeatable = 0.0, 0.0, True
@@ -208,7 +214,7 @@ def agreement(report: Report, cases: Sequence[Case]) -> None:
 
 
 def growth(report: Report) -> None:
-    """Seconds of evidence as one quantity grows, the others fixed: 0.48 M Gaussians, 32 views, 128 regions."""
+    """Add the seconds of evidence as one quantity grows, from 0.48 M Gaussians, 32 views and 128 regions."""
     base = {"n": 480_000, "views": 32, "regions": 128, "scale": 1.0}
     for key, values in (
         ("views", (16, 32, 64, 128)),

@@ -1,4 +1,4 @@
-"""Scenes, cameras and regions that are lifted on a GPU, and how long a step takes there."""
+"""Scenes, cameras and regions for lifts on a GPU, and timing of steps."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from research import rooms
 from tests.captures import trained_scene, training_cameras
 
 CELL, DIMENSION = 60, 512
+"""Side of the square regions in pixels, and number of feature channels."""
 
 
 def grid_labels(camera: Camera) -> torch.Tensor:
@@ -24,7 +25,7 @@ def grid_labels(camera: Camera) -> torch.Tensor:
 
 
 def features(rows: int, device: str = "cuda") -> torch.Tensor:
-    """Unit rows around 40 directions, so that neighbours agree in part."""
+    """Return unit rows around 40 directions, so that neighbors agree partly."""
     g = torch.Generator(device).manual_seed(0)
     classes = torch.randn(40, DIMENSION, generator=g, device=device)
     which = torch.randint(0, 40, (rows,), generator=g, device=device)
@@ -41,7 +42,7 @@ class Case:
 
     @cached_property
     def counts(self) -> list[int]:
-        """Regions of each view."""
+        """Number of regions of each view."""
         return [int(labels.max()) + 1 for labels in self.labels]
 
     def evidence(self, **options: Any) -> Evidence:
@@ -60,7 +61,7 @@ def capture_case(name: str) -> Case:
 
 
 def once(run: Callable[[], Any]) -> float:
-    """Seconds of one run, the GPU waited for on both sides."""
+    """Return the seconds of one run, with synchronization of the GPU before and after."""
     torch.cuda.synchronize()
     start = time.perf_counter()
     run()
@@ -69,7 +70,7 @@ def once(run: Callable[[], Any]) -> float:
 
 
 def timed(run: Callable[[], Any]) -> tuple[float, Any]:
-    """Median seconds of three runs after a first one, and the result of the last."""
+    """Return the median seconds of three runs after a warm-up run, and the result of the last."""
     result, seconds = run(), []
     for _ in range(3):
         del result

@@ -1,10 +1,10 @@
 """Consensus on a GPU: 1.93 million Gaussians, 177 views of 128 regions, 50 million entries of evidence.
 
-    python -m research.gpu_consensus            correctness against the CPU, the same bits again, then seconds
-    python -m research.gpu_consensus --quick    the same on a hundredth of it, on any device
+    python -m research.gpu_consensus            difference from the CPU, bit-exact repetition, then seconds
+    python -m research.gpu_consensus --quick    the same with a hundredth of the Gaussians, on any device
 
-Writes results/gpu_consensus.json. A thing in the made scene is seen by fourteen views that do not begin alike; most of
-its Gaussians lie partly in the region beside its own.
+The command writes results/gpu_consensus.json. In the synthetic scene, fourteen views with different starts show each
+object. Most Gaussians of an object lie partly in the region next to their own.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ DIMENSION = 512
 
 
 def made_evidence(gaussians: int, views: int, device: str) -> Evidence:
-    """Evidence of a made scene, see above."""
+    """Return the evidence of the synthetic scene; see the module docstring."""
     g = torch.Generator().manual_seed(0)
     place = (torch.rand(gaussians, generator=g, dtype=torch.float64) * THINGS).to(device)
     start = torch.randint(0, THINGS, (views,), generator=g).tolist()
@@ -52,7 +52,7 @@ def made_evidence(gaussians: int, views: int, device: str) -> Evidence:
 
 
 def seconds(run: Callable[[], Any], repeats: int = 5) -> float:
-    """Least of some runs, after one that does not count."""
+    """Return the shortest time of some runs, after a warm-up run."""
     found = []
     for _ in range(repeats + 1):
         _wait()
@@ -69,7 +69,7 @@ def _wait() -> None:
 
 
 def check(device: str, table: Callable[[int], Tensor]) -> dict[str, float]:
-    """Differences from the CPU on a small scene; the same bits when run again."""
+    """Return the differences from the CPU on a small scene; raise RuntimeError if a second run gives other bits."""
     evidence = made_evidence(30_000, 12, "cpu")
     features = table(evidence.num_regions)
     here, there = (consensus(evidence.to(d), features.to(d)) for d in ("cpu", device))

@@ -1,4 +1,4 @@
-"""Errors of a lift on a GPU against float64, in samples."""
+"""Errors of a lift on a GPU compared with float64, in samples."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from research.cpu import relative_difference
 from research.gpu_cases import Case
 
 SAMPLE = 20_000
-"""Gaussians."""
+"""Number of sampled Gaussians."""
 
 
 def evidence_error(case: Case, evidence: Evidence) -> float:
-    """Relative Frobenius difference to the float64 reference, in the first view."""
+    """Return the relative Frobenius difference from the float64 reference, in the first view."""
     exact = rasterize_evidence(
         case.scene, case.cameras[:1], case.labels[:1], num_regions=case.counts[:1], dtype=torch.float64
     )
@@ -24,7 +24,7 @@ def evidence_error(case: Case, evidence: Evidence) -> float:
 
 
 def lift_errors(case: Case, evidence: Evidence, table: torch.Tensor, lifted: Lifted) -> tuple[float, float]:
-    """Largest error of R, and of a direction, in a sample of Gaussians."""
+    """Return the largest error of R, and of a direction, in a sample of Gaussians."""
     rows = sample_rows(len(case.scene))
     chosen = evidence.rows.select_rows(rows)
     part = Evidence(
@@ -40,9 +40,10 @@ def lift_errors(case: Case, evidence: Evidence, table: torch.Tensor, lifted: Lif
 
 
 def vote_errors(case: Case, lifted: Lifted, config: RefineConfig, neighbors: Any, source: torch.Tensor) -> float:
-    """Share of a sample of Gaussians whose refined direction is off by more than 1e-3 from that of a float64 vote.
+    """Return the share of sampled Gaussians whose refined direction differs by more than 1e-3 from that of a float64
+    vote.
 
-    Copying another Gaussian is no error where both have the same direction, as those seen in one region only.
+    Copying another Gaussian with the same direction is not an error, for example if only one region contains both.
     """
     rows = sample_rows(len(case.scene))[:: SAMPLE // 2000]
     group = torch.cat([rows[:, None], neighbors.index[rows].long()], dim=1)

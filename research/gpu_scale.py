@@ -1,13 +1,13 @@
-"""Two GPUs against one of them, in the same run: evidence, exchange, lift, neighbours and vote; the front end; whole
-commands; and 100 million Gaussians.
+"""Two GPUs compared with one: evidence, exchange, lift, neighbors and vote; the front end; commands; 100 million
+Gaussians.
 
-    python -m research.gpu_scale                    all of it; starts its two processes itself
+    python -m research.gpu_scale                    all parts; starts its two processes itself
     python -m research.gpu_scale --only core        one part: core, front, large or command
-    python -m research.gpu_scale --device cpu --quick    tiny, through gloo, which runs anywhere
+    python -m research.gpu_scale --device cpu --quick    tiny, through gloo, for any machine
 
-Times go from one barrier of both processes to the next, medians of some rounds, one GPU and two in turns. The error is
-the largest difference of any number of any Gaussian between the two: it has to be 0. SAM and CLIP have random weights.
-What the file holds of other parts stays.
+Times are measured between barriers of both processes, as medians of some rounds, with one GPU and two in turns. The
+error is the largest difference of any number of any Gaussian between the two, and must be 0. SAM and CLIP have random
+weights. Existing metrics of other parts are kept in the file.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ from tests.captures import SHARED
 
 DIMENSION, REGIONS, MAPS = 512, 128, 16
 ENTRY = 12
-"""Bytes of an entry that changes hands."""
+"""Bytes of an exchanged entry."""
 
 
 class Case(NamedTuple):
     scene: GaussianScene
     cameras: Sequence[Camera]
     labels: Sequence[Tensor]
-    """Of some views, taken in turn."""
+    """Label maps of some views, which all views use in turn."""
     table: Tensor
 
     @staticmethod
@@ -72,7 +72,7 @@ class Found(NamedTuple):
 
 
 class Clock:
-    """Seconds from barrier to barrier."""
+    """Clock of the seconds between barriers."""
 
     def __init__(self, team: TorchCommunicator | None, device: str) -> None:
         self.team, self.device, self.seconds = team, device, dict[str, float]()
@@ -96,7 +96,7 @@ def rasterized(case: Case, views: Sequence[int]) -> Evidence:
 
 
 def core_alone(case: Case, device: str) -> Found:
-    """What all Gaussians become in one process, and the seconds of every step."""
+    """Return the results for all Gaussians in one process, and the seconds of every step."""
     clock, stages = Clock(None, device), StageTimer(lambda stage, done, total: None)
     whole = [rasterized(case, views) for views in chunk_views(range(len(case.cameras)))]
     clock.lap("evidence")
@@ -111,7 +111,7 @@ def core_alone(case: Case, device: str) -> Found:
 
 
 def core(team: TorchCommunicator, case: Case, folder: Path, device: str) -> Found:
-    """What the Gaussians of this process become, and the seconds of every step."""
+    """Return the results for all Gaussians with several processes, and the seconds of every step."""
     clock = Clock(team, device)
     portion = Partition.from_means(team, case.scene.means)
     chunks = chunk_views(range(len(case.cameras)), team.world_size)
@@ -142,7 +142,8 @@ def total(seconds: Mapping[str, float]) -> float:
 
 
 def difference(a: Found, b: Found) -> float:
-    """Largest difference of any number of any Gaussian; of directions taken, how many differ."""
+    """Return the largest difference of any number of any Gaussian, or the number of copied directions that differ if
+    larger."""
     pairs = [(getattr(a.scalars, f.name), getattr(b.scalars, f.name)) for f in fields(Scalars)]
     return max(float((a.copied != b.copied).sum()), *(float((x.double() - y.double()).abs().max()) for x, y in pairs))
 
@@ -205,7 +206,7 @@ def large(team: TorchCommunicator, report: Report, case: Case, folder: Path, dev
 
 
 def front(team: TorchCommunicator, report: Report, folder: Path, device: str, quick: bool) -> None:
-    """SAM and CLIP over photographs, in chunks."""
+    """Add the times of SAM and CLIP on random images, in chunks."""
     from normlift_ns.encoders.base import RegionFeatures, iterate_view_features  # noqa: PLC0415
     from research.front_end_inputs import SMALL, Size, injected_sam, random_clip, random_sam  # noqa: PLC0415
 
@@ -251,7 +252,7 @@ def front(team: TorchCommunicator, report: Report, folder: Path, device: str, qu
 
 
 def sam_that_finds(folder: Path, quick: bool) -> None:
-    """Random weights of SAM whose masks pass the rules: sure of themselves, and with sharp borders."""
+    """Write random weights of SAM whose masks pass the rules, with high predicted IoU and sharp borders."""
     from research.front_end_inputs import SMALL, Size, random_sam  # noqa: PLC0415
 
     torch.manual_seed(0)
@@ -266,7 +267,10 @@ def sam_that_finds(folder: Path, quick: bool) -> None:
 
 
 def commands(report: Report, trained: Path, folder: Path, device: str, quick: bool) -> None:
-    """ns-normlift with SAM and CLIP of random weights on one device and on two, caches empty, kernels compiled."""
+    """Add the times of ns-normlift with SAM and CLIP of random weights on one device and on two.
+
+    Caches of features are empty, and kernels are compiled.
+    """
     from research.command import make_weights  # noqa: PLC0415
 
     sam_that_finds(folder / "sam", quick)
@@ -300,7 +304,7 @@ TINY = (("", 20_000, 21), ("_10m", 30_000, 5))
 
 
 def work(team: TorchCommunicator, part: str, report: Report, folder: Path, device: str, quick: bool) -> None:
-    """What both processes do."""
+    """Run one part in both processes."""
     make: Callable[[int, int], Case] = partial(Case.of, device=device, **(SMALL_VIEWS if quick else {}))
     if part == "core":
         for name, n, views in TINY if quick else SIZES:
@@ -340,9 +344,9 @@ if __name__ == "__main__":
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     parser.add_argument("--quick", action="store_true", help="tiny scenes and networks")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
-    parser.add_argument("--folder", type=Path, help="of both processes")
+    parser.add_argument("--folder", type=Path, help="folder that both processes share")
     fox = SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml"
-    parser.add_argument("--config", type=Path, default=fox, help="of the run that commands lift")
+    parser.add_argument("--config", type=Path, default=fox, help="config.yml of the run that commands lift")
     given = parser.parse_args()
     if "RANK" in os.environ:
         worker(given.only, given.output, given.folder, given.device, given.quick)

@@ -1,4 +1,4 @@
-"""Where the time of a run goes on a GPU: seconds of every stage of the evidence, and the longest kernels."""
+"""Time of the evidence on a GPU: seconds of every stage, and the longest kernels."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ STAGES = (
 
 
 def stage_seconds(run: Callable[[], Any]) -> dict[str, float]:
-    """Seconds of every stage of a run, the GPU waited for between them, so that they add up to more than the whole."""
+    """Return the seconds of every stage of a run.
+
+    The GPU is synchronized between stages, so the sum exceeds the time of the whole run.
+    """
     seconds: dict[str, float] = defaultdict(float)
 
     def timer(stage: str, step: Callable[..., Any]) -> Callable[..., Any]:
@@ -52,7 +55,7 @@ def stage_seconds(run: Callable[[], Any]) -> dict[str, float]:
 
 
 def kernel_milliseconds(run: Callable[[], Any], most: int = 12) -> dict[str, float]:
-    """Device milliseconds of the longest kernels of a run, and of all."""
+    """Return the device milliseconds of the longest kernels of a run, and of all kernels."""
     with profile(activities=[ProfilerActivity.CUDA, ProfilerActivity.CPU]) as found:
         run()
         torch.cuda.synchronize()

@@ -1,10 +1,10 @@
-"""Neighbours and vote on one GPU: what is right first, then where the time goes, then how the kernels may be tuned.
+"""Neighbors and vote on one GPU: errors, times by stages, and tuning of the kernels.
 
     python -m research.gpu_vote            the room of 1.93 million Gaussians of `research.gpu`, and the fox
     python -m research.gpu_vote --quick    without the variants
 
-Times are medians of three runs after a first one. The error of a vote is the share of all Gaussians whose refined
-direction is off by more than 1e-3 from that of a vote in float64 of the same directions.
+Times are medians of three runs after a warm-up run. The error of a vote is the share of all Gaussians whose refined
+direction differs by more than 1e-3 from that of a vote in float64 of the same directions.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 
 
 class Room:
-    """A lifted case and its neighbours."""
+    """A lifted case and its neighbors."""
 
     def __init__(self, report: Report, case: Case) -> None:
         self.report, self.case, self.means = report, case, case.scene.means
@@ -84,14 +84,15 @@ class Room:
         return refine(self.means, read or self.lifted.directions, self.reliability, config, **given)
 
     def turned(self, source: torch.Tensor, other: torch.Tensor) -> float:
-        """Share of Gaussians to which two votes give different directions."""
+        """Return the share of Gaussians to which two votes give different directions."""
         rows = (source != other).nonzero().squeeze(1)
         ours, theirs = (self.lifted.directions(x[rows].long()) for x in (source, other))
         return int(((ours - theirs).norm(dim=1) > 1e-3).sum()) / len(source)
 
 
 def correctness(room: Room, configs: Sequence[RefineConfig]) -> None:
-    """Against float64, against the products in tf32x3, against itself, and with progress told."""
+    """Compare votes with float64, with the products in tf32x3, with a second run, and with a run that reports
+    progress."""
     told: list[int] = []
     again = nearest_neighbors(room.means, RefineConfig().k, progress=lambda done, of: told.append(done))
     same = all(torch.equal(a, b) for a, b in zip(again, room.neighbors))
@@ -176,7 +177,7 @@ def blocks(room: Room) -> None:
 
 
 def variants(room: Room, most: int = 2**17) -> None:
-    """The kernel alone, in one block of voters, scaled up to all."""
+    """Measure the kernel alone in one block of voters, scaled up to all voters."""
     n = len(room.means)
     voters = voting.spatial_order(room.means)
     voters = voters[n // 3 : n // 3 + most]
@@ -264,7 +265,7 @@ def main(quick: bool, output: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="without the variants")
+    parser.add_argument("--quick", action="store_true", help="omit the variants")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     main(arguments.quick, arguments.output)

@@ -1,14 +1,14 @@
-"""The grid on which defaults are decided, by the rule of `research.rule` among those of `research.candidates`.
+"""Grid of cells on which defaults are chosen among `research.candidates`, by the rule of `research.rule`.
 
     python -m research.grid                       all scenes, every Gaussian votes; for a GPU
-    python -m research.grid --minutes 9           no new cell after so many minutes; the same command goes on later
+    python -m research.grid --minutes 9           start no cell after this many minutes; repeat to continue
     python -m research.grid --voters 400 --views 22 --gaussians 20000 --scenes demo second third
                                                     for CPUs: a sample votes and counts
     python -m research.grid --statistic real      cells of statistic real, which decide nothing: results/grid_real.json
     python -m research.grid --quick               a small plain room, three cells per kind of region, for the tests
 
-Every finished cell is one line of `--rows`, which a later call reads first. The decision so far is always printed;
-results/grid.json is written when no cell is missing, or with `--report`.
+Each finished cell is one line of the file `--rows`, which later calls read first. The current decision is always
+printed. results/grid.json is written if no cell is missing, or with `--report`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from research.rows import append, read_rows
 from research.rule import CHOICE, CONFIRMATION, REAL, SEEDS, Cell, cells_of, real_cells_of
 
 CHUNK = 50
-"""Cells of one place that a worker takes at a time: whoever takes some first builds the place."""
+"""Number of cells of one place that a worker takes at a time. The worker builds the place first."""
 QUICK = Settings(voters=80, gaussians=2500, pieces=30, room_views=8, room_width=160)
 QUICK_CELLS = (
     ("masks", "clip", "noise only"), ("masks", "clip", "group"), ("masks", "histogram", "arc"),
@@ -43,19 +43,19 @@ QUICK_CELLS = (
 
 
 def finished(path: Path, run: dict[str, Any]) -> dict[Cell, dict[str, Any]]:
-    """The rows of the cells that are done; raises as `read_rows`."""
+    """Return the rows of the finished cells. Raises the same errors as `read_rows`."""
     return {Cell(*row["cell"]): row for row in read_rows(path, run)}
 
 
 @lru_cache(maxsize=1)
 def site_of(place: Place, settings: Settings) -> Site:
-    """The place of the last cell is kept."""
+    """Return the site of a place; the last one is cached."""
     return Site(place, settings)
 
 
 @torch.no_grad()
 def run_cells(cells: Sequence[Cell], settings: Settings, seeds: Sequence[int], path: Path, deadline: float) -> int:
-    """Runs cells of one place until the deadline (`time.time`), and says how many."""
+    """Run cells of one place until the deadline (`time.time`), and return their number."""
     for done, cell in enumerate(cells):
         if time.time() > deadline:
             return done
@@ -71,7 +71,7 @@ def run_cells(cells: Sequence[Cell], settings: Settings, seeds: Sequence[int], p
 
 
 def chunks(cells: Sequence[Cell]) -> Iterator[list[Cell]]:
-    """Cells of one place together, some at a time."""
+    """Yield up to `CHUNK` cells of one place at a time."""
     places: dict[Place, list[Cell]] = {}
     for cell in cells:
         places.setdefault(Place.of(cell), []).append(cell)
@@ -83,7 +83,7 @@ def chunks(cells: Sequence[Cell]) -> Iterator[list[Cell]]:
 def run_all(
     missing: Sequence[Cell], settings: Settings, seeds: Sequence[int], path: Path, workers: int, deadline: float
 ) -> None:
-    """Runs all cells, in several processes if asked for."""
+    """Run all cells, in several processes if `workers` is above 1."""
     jobs = [(some, settings, seeds, path, deadline) for some in chunks(missing)]
     if workers == 1:
         for job in jobs:
@@ -96,7 +96,7 @@ def run_all(
 
 
 def cells_to_run(scenes: Sequence[str], quick: bool, real: bool) -> list[Cell]:
-    """All cells of the scenes, or a few of them."""
+    """Return all cells of the scenes, or a few of them if `quick` is True."""
     cells = [cell for scene in scenes for cell in (real_cells_of if real else cells_of)(scene)]
     few = [(kind, REAL if real else statistic, damage) for kind, statistic, damage in QUICK_CELLS]
     return [cell for cell in cells if not quick or (cell[1:4] in few and cell.views in ("all", "3"))]
@@ -137,12 +137,12 @@ if __name__ == "__main__":
     parser.add_argument("--scenes", nargs="+", default=[*CHOICE, *CONFIRMATION], choices=[*CHOICE, *CONFIRMATION])
     parser.add_argument("--statistic", choices=[REAL], help="run the cells of this statistic instead of the grid's")
     parser.add_argument("--voters", type=int, help="Gaussians of a scene that vote and count; all by default")
-    parser.add_argument("--gaussians", type=int, help="of each room; 40,000 by default")
+    parser.add_argument("--gaussians", type=int, help="Gaussians of each room; 40,000 by default")
     parser.add_argument("--views", type=int, help="training views of the tabletop; all by default")
     parser.add_argument("--room-views", type=int, help="training views of each room; 24 and 30 by default")
     parser.add_argument("--pieces", type=int, help="superpixels, cells or patches per image; 256, 256, 1024 by default")
     parser.add_argument("--workers", type=int, default=1, help="processes that run cells")
-    parser.add_argument("--minutes", type=float, help="no cell begins later than this")
+    parser.add_argument("--minutes", type=float, help="minutes after which no cell starts")
     parser.add_argument("--quick", action="store_true", help="a few cells of a small plain room")
     parser.add_argument("--report", action="store_true", help="write the report even if cells are missing")
     parser.add_argument("--rows", type=Path, default=RESULTS / "grid_rows.jsonl", help="file of finished cells")

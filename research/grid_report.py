@@ -1,4 +1,4 @@
-"""What a run of the grid comes to: the decision, and what leads to it, as metrics and as a table."""
+"""Summary of a run of the grid: the decision and the figures behind it, as metrics and as a table."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ FACTS = {
 }
 FINAL = "1: by all cells and Gaussians, 0: by some"
 DEFAULT = "consensus_posterior tau 0.9 gamma 0.05"
-"""What the grid chose, which has a column of its own for statistic real too."""
+"""Choice of the grid, which also has a column for statistic real."""
 AXES = ("kind", "statistic", "damage", "views")
 
 
 def report_of(
     rows: Mapping[Cell, Mapping[str, Any]], names: Sequence[str], expected: int, sizes: Mapping, *, real: bool = False
 ) -> Report:
-    """All metrics of the rows of the grid.
+    """Return all metrics of the rows of the grid.
 
     Args:
-        expected: how many cells there are, done or not.
-        sizes: settings of the run that are numbers or None.
-        real: the rows are of statistic real, and nothing is decided.
+        expected: Number of cells, finished or not.
+        sizes: Settings of the run that are numbers or None.
+        real: True if the rows are of statistic real, so that nothing is decided.
     """
     report = Report("grid_real" if real else "grid")
     report.add("cells", len(rows), f"of {expected}")
@@ -66,7 +66,7 @@ def report_of(
 
 
 def shown(names: Sequence[str], choice: str) -> list[str]:
-    """Candidates with a column of their own in the table by damage, statistic, kind and views."""
+    """Return the candidates with a column of their own in the table by damage, statistic, kind and views."""
     methods = [name for name in names if " " not in name and name != "none"]
     return [*methods, *(name for name in (choice,) if name not in (*methods, "none"))]
 
@@ -83,7 +83,7 @@ def _add_verdict(report: Report, key: str, name: str, found: Verdict, rows: Mapp
 
 
 def interval(rows: Mapping[Cell, Mapping[str, Any]], name: str) -> float:
-    """Half of the 95 % interval over seeds of the mean gain over all cells."""
+    """Return half of the 95 % interval over seeds of the mean gain over all cells."""
     gains = np.mean([np.subtract(row["miou"][name], row["miou"]["none"]) for row in rows.values()], axis=0)
     return float(stats.t.ppf(0.975, len(gains) - 1) * gains.std(ddof=1) / len(gains) ** 0.5)
 
@@ -99,7 +99,7 @@ def _add_columns(report: Report, name: str, rows: Mapping[Cell, Mapping[str, Any
 
 
 def show(report: Report, names: Sequence[str]) -> None:
-    """Prints the decision, and what the clauses say of every candidate, best mean first, in few characters."""
+    """Print the decision, and a compact table of the figures of every candidate, best mean first."""
     values = {metric.key: metric for metric in report.metrics}
     facts = ("mean", "gain", "gain_ci95", "undamaged", "three_views", "worst", "worse", "column", "copied")
     for group in ("choice", *CONFIRMATION):

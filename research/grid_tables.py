@@ -1,4 +1,4 @@
-"""The tables of the grid on which defaults are decided."""
+"""Tables of the grid on which defaults are chosen."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ COSINES = {
     "spread": "spread of the lifted cosines within an object, as a share of their median",
     "agreement": "agreement B of the regions",
 }  # fmt: skip
-"""Keys of geometry.json, without the capture, and their rows."""
+"""Labels of the rows, by keys of geometry.json without the capture."""
 SHARES = {"worse": "worse cells", "column": "worst column", "copied": "copied"}
 
 
 def verdicts(grid: Document, group: str) -> str:
-    """What the rule's clauses say of every candidate, best mean first."""
+    """Return a table with the figures of every clause of the rule for every candidate, best mean first."""
     v, start, end = grid.values, f"{group}.", ".eligible"
     keys = [key for key in v if key.startswith(start) and key.endswith(end)]
     units, rows = {metric.key: metric.unit for metric in grid.metrics}, []
@@ -34,7 +34,8 @@ def verdicts(grid: Document, group: str) -> str:
 
 
 def columns(grid: Document, real: Document) -> str:
-    """Gain, and gain in the worst cell, of the methods in every column of the grid, and of statistic real beside it."""
+    """Return a table of the gain, and the gain in the worst cell, by column of the grid, and next to it for statistic
+    real."""
     header, rows = _columns(grid)
     last = max((i for i, row in enumerate(rows) if row[0].startswith("statistic: ")), default=-1)
     beside = [row for row in _columns(real)[1] if row[0].startswith("statistic: ")]
@@ -42,7 +43,7 @@ def columns(grid: Document, real: Document) -> str:
 
 
 def real_columns(real: Document) -> str:
-    """The columns of statistic real."""
+    """Return the columns of statistic real."""
     header, rows = _columns(real)
     return table(header, [row for row in rows if not row[0].startswith("kind: ")])
 
@@ -59,7 +60,7 @@ def _columns(grid: Document) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
 
 
 def geometry(found: Document) -> str:
-    """Cosines on both captures."""
+    """Return a table of the cosines on both captures."""
     v, rows = found.values, []
     for key, label in COSINES.items():
         captures = (f"{v[x]:.3f}" if (x := f"{capture}.{key}") in v else "" for capture in ("fox", "tabletop"))

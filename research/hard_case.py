@@ -1,4 +1,4 @@
-"""What a hard case is, and the rule by which its errors pass or fail: written down before anything was measured."""
+"""Definition of a hard case, and the bounds on its errors, which were fixed before anything was measured."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 
 class Quantity(NamedTuple):
-    """An error, and the most that it may be where a case names no other bound."""
+    """An error and its default bound, for cases without a bound of their own."""
 
     bound: float
     unit: str
-    """What the number is, in the words of the page."""
+    """Meaning of the number, in the words of the page."""
 
 
 QUANTITIES = {
@@ -24,19 +24,18 @@ QUANTITIES = {
     "scalars_double": Quantity(1e-12, "absolute; relative for N_eff and W"),
     "wrong": Quantity(0.0, "answers that are not the expected ones"),
 }
-"""float32 keeps seven digits. Five of a cosine, and four of a sum over pixels that a threshold may gain or lose, are
-asked of it; twelve of the sixteen digits of float64.
-"""
+"""Bounds for float32, which has seven digits: five digits of a cosine, and four of a sum over pixels, because a
+threshold may include or exclude pixels. Of the sixteen digits of float64, twelve are required."""
 DOUBLE = "_double"
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Where and how large a case is run."""
+    """Device and size of a run."""
 
     device: str = "cpu"
     small: bool = False
-    """For the tests: the same case, with fewer numbers where there are many."""
+    """True for the same cases with fewer numbers, for the tests."""
 
     @property
     def backends(self) -> tuple[str, ...]:
@@ -46,23 +45,23 @@ class Setting:
 
 @dataclass(frozen=True)
 class Case:
-    """A case with what is expected of it. `measure` gives its errors against float64, by the names of QUANTITIES."""
+    """A case with its expected result. `measure` returns its errors against float64, by the names of `QUANTITIES`."""
 
     key: str
     title: str
     expected: str
     seen: str
-    """What a person sees who has such a scene."""
+    """Effect that a user with such a scene sees."""
     measure: Callable[[Setting], Mapping[str, float]]
     bounds: Mapping[str, float] = field(default_factory=dict)
-    """Bounds other than those of QUANTITIES, for the reason that `expected` gives."""
+    """Bounds that differ from those of `QUANTITIES`, for the reason in `expected`."""
 
     def bound(self, quantity: str) -> float:
-        """The most that an error may be."""
+        """Return the largest accepted error."""
         return self.bounds.get(quantity, QUANTITIES[quantity].bound)
 
     def failures(self, errors: Mapping[str, float]) -> list[str]:
-        """What is not within its bound, NaN among it."""
+        """Return messages for the errors that exceed their bounds or are NaN."""
         return [
             f"{self.key}: {quantity} {error:.1e}, at most {self.bound(quantity):.1e}"
             for quantity, error in errors.items()

@@ -1,4 +1,4 @@
-"""Hard cases of the rasterizers, measured against loops over Python floats (tests/rasterization/oracle.py)."""
+"""Hard cases of the rasterizers, compared with loops over Python floats (tests/rasterization/oracle.py)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def gaussians(
     opacities: Sequence[float],
     quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
 ) -> GaussianScene:
-    """A float32 scene of Gaussians that are turned alike."""
+    """Return a float32 scene of Gaussians with the same rotation."""
     rows = (torch.tensor(x, dtype=torch.float32) for x in (means, [quat] * len(means), scales, opacities))
     return GaussianScene(*rows)
 
@@ -33,7 +33,7 @@ def gaussians(
 def rasterized(
     scene: GaussianScene, views: Sequence[tuple[Camera, Tensor]], backend: str, double: bool, mode: str, device: str
 ) -> Evidence:
-    """Evidence of some views with three regions each."""
+    """Return the evidence of some views with three regions each."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # Gaussians that are not drawn, where a case is about them
         return rasterize_evidence(
@@ -48,13 +48,13 @@ def rasterized(
 
 
 def matrix(evidence: Evidence) -> Tensor:
-    """[N, 3 regions and one column for the unlabelled of every view], float64."""
+    """Return the evidence as a float64 matrix, [N, 3 regions and one column of unlabeled pixels per view]."""
     views = evidence.num_views
     return torch.cat([dense(evidence.rows, 3 * views), dense(evidence.unlabeled, views)], dim=1)
 
 
 def exact_matrix(scene: GaussianScene, views: Sequence[tuple[Camera, Tensor]], mode: str) -> Tensor:
-    """The same by loops over Python floats."""
+    """Return the same matrix from loops over Python floats."""
     labeled, blank = [], []
     for camera, labels in views:
         weights = torch.from_numpy(compositing_matrix(scene, camera, mode == "antialiased")).flatten(0, 1)
@@ -67,7 +67,8 @@ def exact_matrix(scene: GaussianScene, views: Sequence[tuple[Camera, Tensor]], m
 def evidence_errors(
     setting: Setting, scene: GaussianScene, views: Sequence[tuple[Camera, Tensor]], mode: str = "classic"
 ) -> dict[str, float]:
-    """Largest error of an entry over all backends, as a share of the largest entry (absolute where that is below 1)."""
+    """Return the largest error of an entry over all backends, relative to the largest entry (absolute if that is below
+    1)."""
     exact = exact_matrix(scene, views, mode)
     size = max(1.0, float(exact.max()))
 
@@ -116,7 +117,7 @@ def long_needles(setting: Setting) -> dict[str, float]:
 
 
 def near_plane(setting: Setting) -> dict[str, float]:
-    """Behind the camera, at its centre, just before and just behind the plane, of all sizes on the screen."""
+    """Place Gaussians of all sizes behind the camera, at its center, and just in front of and behind the near plane."""
     depths, sizes = (-1.0, 0.0, 0.00999, 0.01001, 0.02, 1.0), (1e-4, 1e-2, 1.0)
     means = [[0.001 * i, 0.0, z] for i, z in enumerate(depths * 3)]
     scene = gaussians(means, [[s] * 3 for s in sizes for _ in depths], [0.3] * 18)
@@ -140,7 +141,7 @@ def enormous(setting: Setting) -> dict[str, float]:
 
 
 def out_of_range(setting: Setting) -> dict[str, float]:
-    """Every kind of parameter that no float32 rasterizer can draw, among others that are as good as alone."""
+    """Mix Gaussians with parameters that no float32 rasterizer can draw with others, which must not change."""
     others = random_scene(20, seed=1, dtype=torch.float32, size=0.4)
     bad = [
         *(("scales", 1, math.exp(x)) for x in (20.1, 30, 44, 60, 88)),
@@ -175,7 +176,7 @@ def coincident(setting: Setting) -> dict[str, float]:
 
 
 def stack(setting: Setting) -> dict[str, float]:
-    """40 sheets of opacity 0.5: the 14th would leave less than the least transmittance."""
+    """Stack 40 sheets of opacity 0.5; the 14th would leave less than the smallest transmittance."""
     scene = gaussians([[0.0, 0.0, i / 40] for i in range(40)], [[1e3] * 3] * 40, [0.5] * 40)
     return evidence_errors(setting, scene, _views(1, width=20, height=18))
 
@@ -192,7 +193,7 @@ def scene_sizes(setting: Setting) -> dict[str, float]:
 
 
 def unseen(setting: Setting) -> dict[str, float]:
-    """Behind the camera, beyond the far plane, far to the side, and one that is seen."""
+    """Place Gaussians behind the camera, beyond the far plane and far to the side, and one visible Gaussian."""
     means = [[0.0, 0.0, -9.0], [0.0, 0.0, 1e11], [1e6, 0.0, 0.0], [0.0, -1e17, 0.0], [0.0, 0.0, 0.0]]
     scene, (view,) = gaussians(means, [[0.3] * 3] * 5, [0.9] * 5), _views(1)
     errors, wrong = evidence_errors(setting, scene, [view]), 0

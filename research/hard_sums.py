@@ -1,4 +1,4 @@
-"""Hard cases of the lift, the storage and the vote, measured against the formulas in extended precision."""
+"""Hard cases of the lift, the storage and the vote, compared with the formulas in extended precision."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _GAPS = (1e-1, 1e-2, 1e-3, 1e-4)
 
 
 def evidence_of(weights: Tensor, region_view: Sequence[int], blank: Tensor | None = None) -> Evidence:
-    """Evidence of a dense matrix [N, S], and of the unlabelled weights [N, views]."""
+    """Return the evidence of a dense matrix [N, S] and of unlabeled weights [N, views]."""
     views = max(region_view) + 1
     blank = torch.zeros(len(weights), views, dtype=weights.dtype) if blank is None else blank
 
@@ -35,7 +35,8 @@ def evidence_of(weights: Tensor, region_view: Sequence[int], blank: Tensor | Non
 def exact_lift(
     weights: Tensor, region_view: Sequence[int], table: Tensor, blank: Tensor | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Directions [N, D] and (norm, C_intra, C_inter, R, N_eff, W) [N, 6] with beta = 1, in extended precision."""
+    """Return directions [N, D] and (norm, C_intra, C_inter, R, N_eff, W) [N, 6] with beta = 1, in extended
+    precision."""
     e, view = weights.double().numpy().astype(np.longdouble), np.array(region_view)
     f = table.double().numpy().astype(np.longdouble)
     f = f / np.sqrt((f * f).sum(axis=1, keepdims=True))
@@ -54,7 +55,7 @@ def exact_lift(
 
 
 def numbers(lifted: Lifted) -> tuple[np.ndarray, np.ndarray]:
-    """What a lift found, as `exact_lift` gives it."""
+    """Return the scalars of a lift in the order of `exact_lift`."""
     s = lifted.scalars
     columns = torch.stack([s.norm, s.c_intra, s.c_inter, s.reliability, s.n_eff, s.weight], dim=1)
     return lifted.directions().double().cpu().numpy(), columns.double().cpu().numpy()
@@ -63,7 +64,7 @@ def numbers(lifted: Lifted) -> tuple[np.ndarray, np.ndarray]:
 def lift_errors(
     setting: Setting, weights: Tensor, region_view: Sequence[int], table: Tensor, blank: Tensor | None = None
 ) -> dict[str, float]:
-    """Errors of a lift of float32 weights and features, in float32 and in float64."""
+    """Return the errors of a lift of float32 weights and features, in float32 and in float64."""
     directions, scalars = exact_lift(weights, region_view, table, blank)
     scale = np.ones_like(scalars)
     scale[:, 4:] = np.where(scalars[:, 4:] > 0, scalars[:, 4:], 1)
@@ -91,7 +92,7 @@ def cancelling(setting: Setting) -> dict[str, float]:
 
 
 def nearly_cancelling(setting: Setting) -> dict[str, float]:
-    """Errors times the gap: what is left of a float32 table."""
+    """Return the errors multiplied by the gap, which limits the precision of a float32 table."""
     found = []
     for gap in _GAPS:
         u, noise = unit_rows(1, 512, 0), gap * unit_rows(1, 512, 1)
@@ -113,7 +114,7 @@ def weights_of_all_sizes(setting: Setting) -> dict[str, float]:
 
 
 def weights_beyond(setting: Setting) -> dict[str, float]:
-    """Below 1e-15, subnormal ones and the negative zero among them: as no evidence. NaN, above 1e15: refused."""
+    """Check that weights below 1e-15 count as no evidence, and that NaN and weights above 1e15 raise an error."""
     table, wrong = unit_rows(2, 16, 0, torch.float32).to(setting.device), 0
     for dtype in (torch.float32, torch.float64):
         low = torch.tensor([[1e-16, 0], [1e-30, 1e-30], [1e-44, 0], [1e-38, -0.0]], dtype=dtype)
@@ -155,7 +156,7 @@ def dimensions(setting: Setting) -> dict[str, float]:
 
 
 def tiny_components(setting: Setting) -> dict[str, float]:
-    """Features on an axis but for subnormal numbers and negative zeros."""
+    """Use features along an axis with additional subnormal numbers and negative zeros."""
     table = torch.zeros(4, 512)
     table[:, 0] = torch.tensor([1.0, 1.0, -1.0, 1.0])
     table[0, 1:], table[1, 1:], table[3, 1:] = 1e-42, -0.0, 1e-38
@@ -171,7 +172,7 @@ def diluted(setting: Setting) -> dict[str, float]:
 
 
 def _cosine_errors(setting: Setting, table: Tensor, rank: int | None) -> tuple[Tensor, Tensor]:
-    """Errors [N] of the cosines of stored directions to 50 texts, and their bounds."""
+    """Return the errors [N] of the cosines of stored directions to 50 texts, and their bounds."""
     n, d = 40, table.shape[1]
     weights = torch.rand(n, len(table), generator=generator(4)) ** 8
     region_view = (torch.arange(len(table)) // 3).tolist()
@@ -212,7 +213,7 @@ def _wrong(found: Sequence[int], expected: Sequence[int]) -> int:
 
 
 def vote_ties(setting: Setting) -> dict[str, float]:
-    """Two candidates at the same distance, of the same R, opposite each other: the first in the file, in any order."""
+    """Use two opposite candidates at the same distance with the same R. The first in the file must win in any order."""
     points, axes = torch.tensor([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0]]), torch.eye(8)[:3]
     wrong = 0
     for order in itertools.permutations(range(3)):
@@ -225,7 +226,8 @@ def vote_ties(setting: Setting) -> dict[str, float]:
 
 
 def vote_underflow(setting: Setting) -> dict[str, float]:
-    """One Gaussian 1,000 widths from all others, whose decay is e^-500,000: the nearest reliable one still wins."""
+    """Place a Gaussian 1,000 widths from all others, so that its decay is e^-500,000. The nearest reliable one must
+    still win."""
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [1000, 0, 0], [1e6, 0, 0]])
     return {"wrong": _wrong(_sources(setting, points, torch.eye(8)[:5], [0.9, 0.9, 0.9, 0.0, 0.0], 4)[3:], [2, 2])}
 

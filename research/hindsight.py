@@ -1,17 +1,23 @@
-"""The best that a rule for the threshold could reach on a capture if its number were chosen there, in hindsight.
+"""Best results on a capture of rules for the threshold whose parameter is chosen on the same capture.
 
     python -m research.hindsight castle=RUN/config.yml          results/hindsight.json
 
-Prototypes and pixels are those of `research.cut`. Families of rules, each with one number for all prototypes: a fixed
-cosine; a share of the top cosine; a share of the way from the median to the top; a relevancy of rule contrast;
-the same number of Gaussians for all, as a share; the most stable threshold, with another range. The number is the one
-with the largest mean over prototypes of IoU divided by the best IoU of the cosine.
+Prototypes and pixels are those of `research.cut`. Each family of rules has one parameter for all prototypes:
+
+* a fixed cosine;
+* a share of the top cosine;
+* a share of the distance from the median to the top;
+* a relevancy of rule contrast;
+* the same number of Gaussians for all, as a share;
+* the range in which the most stable threshold is searched.
+
+The chosen parameter has the largest mean over prototypes of IoU divided by the best IoU of the cosine.
 
 Keys: <capture>.<family>.mean, .worst and .below (the number under 40 %), over prototypes; <capture>.default likewise;
-<capture>.<label>.best, the best IoU, and .share, of the pixels. The numbers themselves are printed.
+<capture>.<label>.best, the best IoU, and .share, the share of the pixels. The parameters themselves are printed.
 
-What came of it: on the castle, which confirms the default threshold, a fixed cosine of 0.74 would reach 71 % in the
-mean, all other families 64 % or less, and each leaves at least one prototype below 7 %. The default reaches 55 %.
+Result: on the castle, a fixed cosine of 0.74 would reach 71 % on average, and all other families 64 % or less. Each
+family leaves at least one prototype below 7 %. The default, which the castle confirms, reaches 55 %.
 """
 
 from __future__ import annotations
@@ -46,7 +52,7 @@ class Prototype:
         self.median, self.top = np.quantile(self.cosines, (0.5, TOP_QUANTILE))
 
     def reached(self, threshold: float) -> float:
-        """IoU at a threshold as a share of the best."""
+        """Return the IoU at a threshold, relative to the best IoU."""
         return float(self.iou[np.searchsorted(-self.descending, -threshold, side="left")] / self.best)
 
 

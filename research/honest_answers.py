@@ -1,20 +1,20 @@
-"""Thresholds suggested from histograms, and verdicts without a null vocabulary, against the truth.
+"""Thresholds suggested from histograms, and verdicts without a null vocabulary, compared with the truth.
 
-    python -m research.honest_answers           plain room, and the tabletop where the captures are
+    python -m research.honest_answers           plain room, and the tabletop if the captures are available
     python -m research.honest_answers --scenes demo
 
-Writes results/honest_answers.json. CLIP-like features are made as in `damage`, of vectors of LVIS names: those of the
-scene's classes (in the plain room 13 names drawn at random), four others as negatives, and 200 others as the unrelated
-words of rule contrast. 60 names more, none closer to a class than a cosine of 0.9, are asked for as well and are in no
-scene. The encoder color sees images of the plain room, cut into superpixels and into squares; words that are not
-in the scene are all names of the XKCD survey whose cosine to every color of the room is below 0.5.
+The command writes results/honest_answers.json. CLIP-like features are made as in `damage` from vectors of LVIS names.
+They use those of the scene's classes (in the plain room, 13 random names), and four others as negatives. 200 further
+names are the unrelated words of rule contrast. 60 more names, whose cosine to every class is below 0.9, are queried
+although no scene contains them. The encoder color uses images of the plain room, divided into superpixels and into
+squares. Its absent words are all names of the XKCD survey whose cosine to every color of the room is below 0.5.
 
 Keys: <scene>.<damage or cut>.<rule>.
-  iou.<threshold>     mean IoU over the classes of what is selected at a threshold: fixed (0.5, colors 0.7), suggested,
-                      Otsu's, and the best for each class, which nobody knows
+  iou.<threshold>     mean IoU over the classes of the selection at a threshold: fixed (0.5, colors 0.7), suggested,
+                      Otsu's, and the best for each class, which needs the truth
   visible.<verdict>   % of the classes that get a verdict
-  absent.<verdict>    % of the words that are not in the scene that get it
-  auc.<statistic>     the chance that a class has more of a statistic than a word that is not in the scene
+  absent.<verdict>    % of the absent words that get it
+  auc.<statistic>     the probability that a statistic is larger for a class than for an absent word
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _BINS = 128
 
 
 def otsu(values: np.ndarray) -> float:
-    """Otsu's threshold, of 128 bins."""
+    """Return Otsu's threshold from 128 bins."""
     counts, edges = np.histogram(values, _BINS)
     share, middle = counts / counts.sum(), (edges[1:] + edges[:-1]) / 2
     weight, moment = share.cumsum(), (share * middle).cumsum()
@@ -66,7 +66,7 @@ def iou(relevancy: np.ndarray, truth: np.ndarray, threshold: float) -> float:
 
 
 def chance(more: list[float], less: list[float]) -> float:
-    """The chance that one of the first is larger than one of the second, ties half."""
+    """Return the probability that a value of `more` is larger than one of `less`; ties count half."""
     a, b = np.array(more)[:, None], np.array(less)
     return float(((a > b) + 0.5 * (a == b)).mean())
 
@@ -78,7 +78,7 @@ STATISTICS = {
     "otsu_separation": lambda h, x: float(np.var([x[x > otsu(x)].mean(), x[x <= otsu(x)].mean()]) / (1e-12 + x.var())),
     "skewness": lambda h, x: float((((x - x.mean()) / (1e-9 + x.std())) ** 3).mean()),
 }
-"""What might tell the classes from words that are not in the scene, from a histogram and the relevancies."""
+"""Statistics that may separate the classes from absent words, from a histogram and the relevancies."""
 
 
 def measure(
@@ -92,13 +92,14 @@ def measure(
     cosines: tuple[np.ndarray, np.ndarray] | None = None,
     null_tops: list[float] | None = None,
 ) -> None:
-    """Adds the rows of one rule.
+    """Add the rows of one rule.
 
     Args:
-        present: relevancies [N, K] of the classes, of Gaussians with a direction; absent: [N, M] of other words.
-        truth: [N] class, -1 where it is not known.
-        cosines: those of the classes and of the other words; by default, the relevancies are cosines.
-        null_tops: best cosines of the null words, in ascending order.
+        present: [N, K] relevancies of the classes, for Gaussians with a direction.
+        absent: [N, M] relevancies of words that are not in the scene.
+        truth: [N] class, or -1 if it is unknown.
+        cosines: Cosines of the classes and of the absent words (default: the relevancies are cosines).
+        null_tops: Best cosines of the null words, in ascending order.
     """
     kind, valid = encoder_kind(encoder), np.ones(len(truth), bool)
     fixed = kind.threshold if kind.rule == rule and not isinstance(kind.threshold, str) else 0.5
@@ -133,7 +134,7 @@ def measure(
 
 
 def refined_directions(means: torch.Tensor, evidence: Evidence, features: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Directions after the paper's vote, and which Gaussians have one."""
+    """Return the directions after the paper's vote, and a mask of the Gaussians that have one."""
     lifted = lift(evidence, features)
     config = RefineConfig(vote="paper")
     neighbors, s = nearest_neighbors(means, config.k), lifted.scalars
@@ -143,7 +144,7 @@ def refined_directions(means: torch.Tensor, evidence: Evidence, features: torch.
 
 
 def clip_like(report: Report, world: World) -> None:
-    """Rows of a world whose classes are LVIS names."""
+    """Add the rows of a world whose classes are LVIS names."""
     words, g = real_words(), torch.Generator().manual_seed(1)
     if world.classes != len(words.classes):
         words = Words(words.others[torch.randperm(len(words.others), generator=g)[: world.classes]], words.others)
@@ -166,7 +167,7 @@ def clip_like(report: Report, world: World) -> None:
 
 
 def colours(report: Report, num_gaussians: int, views: int, width: int) -> None:
-    """Add the rows of the plain room, seen by the encoder color."""
+    """Add the rows of the plain room with the encoder color."""
     from matplotlib.colors import XKCD_COLORS  # noqa: PLC0415 (the names)
 
     room, cameras, texts = plain_room(num_gaussians), demo_cameras(views, width, width * 3 // 4), ColorEncoder()

@@ -1,8 +1,8 @@
-"""Figures of the house: its size, names that mean two things, long signatures, knots, and what one command reaches.
+"""Figures of the code base: size, names with two meanings, long signatures, complex functions, and imports of a
+command.
 
-python -m research.house
-python -m research.house --names           the names that several modules define
-python -m research.house --reach cli.query the modules that a command can load, lazily too
+python -m research.house python -m research.house --names           the names that several modules define python -m
+research.house --reach cli.query the modules that a command can load, including lazily
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1] / "normlift_ns"
 MANY = 8
-"""Parameters of a function, `self` and `cls` not counted; kernels and their launchers may have more."""
+"""Largest usual number of parameters, without `self` and `cls`. Kernels and their launchers can have more."""
 KNOT = 15
 """Cyclomatic complexity above which a function is hard to follow."""
 KERNELS = ("normlift_ns.kernels", "normlift_ns.rasterization.numba")
 ALIASES = ("normlift_ns.plugin.", "normlift_ns.scripts.")
-"""Packages of modules for old paths, which hand on names of others."""
+"""Packages of modules for old paths, which only re-export names."""
 BRANCHES = (ast.If, ast.IfExp, ast.For, ast.AsyncFor, ast.While, ast.ExceptHandler, ast.Assert, ast.comprehension)
 SAME = {
     "entrypoint",  # of every command
@@ -47,21 +47,21 @@ SAME = {
     "render",
     "select",
 }
-"""Names that many modules define on purpose, with one meaning."""
+"""Names that several modules define on purpose with one meaning."""
 
 
 def module_name(path: Path) -> str:
-    """The dotted name of a file of the package."""
+    """Return the dotted module name of a file of the package."""
     return ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
 
 
 def is_alias(name: str) -> bool:
-    """Whether a module only keeps an old path importable."""
+    """Return True if a module only keeps an old path importable."""
     return f"{name}.".startswith(ALIASES)
 
 
 def code_lines(source: str) -> int:
-    """Lines that hold code: no blanks, comments and docstrings."""
+    """Return the number of lines with code, without blank lines, comments and docstrings."""
     skip = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
     lines = {
         line
@@ -76,7 +76,7 @@ def code_lines(source: str) -> int:
 
 
 def public_names(tree: ast.Module) -> Iterator[str]:
-    """Names that a module defines at its top level for others."""
+    """Yield the public names that a module defines at its top level."""
     for node in tree.body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
             names = [node.name]
@@ -90,7 +90,7 @@ def public_names(tree: ast.Module) -> Iterator[str]:
 
 
 def functions(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef | ast.AsyncFunctionDef, bool]]:
-    """Functions of a module, and whether each is a method."""
+    """Yield the functions of a module, each with True if it is a method."""
     for node in ast.walk(tree):
         for child in ast.iter_child_nodes(node):
             if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -98,7 +98,7 @@ def functions(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef | ast.AsyncFun
 
 
 def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef, method: bool) -> int:
-    """The number of parameters, `self` and `cls` not counted."""
+    """Return the number of parameters, without `self` and `cls`."""
     given = function.args
     count = len([*given.posonlyargs, *given.args, *given.kwonlyargs]) + bool(given.vararg) + bool(given.kwarg)
     static = any(isinstance(x, ast.Name) and x.id == "staticmethod" for x in function.decorator_list)
@@ -106,7 +106,7 @@ def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef, method: bool) -
 
 
 def complexity(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Cyclomatic complexity: one more than the branches (McCabe)."""
+    """Return the cyclomatic complexity, which is one more than the number of branches (McCabe)."""
     count = 1
     for node in ast.walk(function):
         count += isinstance(node, BRANCHES)
@@ -117,7 +117,8 @@ def complexity(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 
 def imported(tree: ast.Module, modules: set[str]) -> set[str]:
-    """Modules of ours that a module imports, when it is loaded or later; not those for types alone."""
+    """Return the modules of this package that a module imports, at its start or lazily, without imports for types
+    alone."""
     found: set[str] = set()
 
     def walk(node: ast.AST) -> None:
@@ -138,7 +139,7 @@ def imported(tree: ast.Module, modules: set[str]) -> set[str]:
 
 
 def reachable(start: str, needs: dict[str, set[str]]) -> set[str]:
-    """Everything that a module can load."""
+    """Return all modules that a module can load."""
     seen, todo = set(), [start]
     while todo:
         name = todo.pop()
@@ -150,7 +151,7 @@ def reachable(start: str, needs: dict[str, set[str]]) -> set[str]:
 
 
 def main() -> None:
-    """Prints the figures."""
+    """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--names", action="store_true")
     parser.add_argument("--reach", default="cli.query")

@@ -1,10 +1,10 @@
-"""The encoder of ImageNet's classes on the fox: seconds per image; average precision of "fox" before and after a lift.
+"""Encoder of ImageNet's classes on the fox: seconds per image, and average precision of "fox" before and after a lift.
 
     python -m research.imagenet                  results/imagenet.json; weights: ns-normlift-weights --get imagenet
     python -m research.imagenet --device cuda    seconds and differences from a CPU; results/imagenet_gpu.json
 
-Average precision is that of the pixels of six images with hand-drawn labels, pooled: in 2D by the cosine of their
-region, after the lift by the rendered relevancy.
+The average precision pools the pixels of six images with labels drawn by hand. In 2D, it uses the cosine of the region
+of a pixel; after the lift, it uses the rendered relevancy.
 """
 
 from __future__ import annotations

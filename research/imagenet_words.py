@@ -1,16 +1,16 @@
 """Words for the 1,000 classes of ImageNet, from WordNet 3.0: python -m research.imagenet_words /usr/share/wordnet
 
-Writes normlift_ns/encoders/imagenet_words.json. The folder is that of Debian's package wordnet-base: index.noun,
-data.noun, noun.exc and cntlist.rev of Princeton's WordNet 3.0, whose offsets in data.noun are ImageNet's synset ids.
-The ids of the classes, in the order of the network's outputs, are those of the table itself, so no other source is
-needed.
+The command writes normlift_ns/encoders/imagenet_words.json. The folder is that of Debian's package wordnet-base:
+index.noun, data.noun, noun.exc and cntlist.rev of Princeton's WordNet 3.0. Its offsets in data.noun are ImageNet's
+synset ids. The ids of the classes, in the order of the network's outputs, are read from the existing table, so no other
+source is needed.
 
-A class has the lemmas of its synset as names. A lemma after the first is left out if the annotated texts of WordNet use
-it ten times or more, but never for this synset: no one calls a promontory a head, or a lighter a light. A hypernym is a
-synset above one or more classes, and at most half of them: "artifact" and "object" tell nothing apart. A lemma of
-several hypernyms belongs to the one whose sense WordNet lists first, so that "cat" means the domestic cat rather than
-the lion or the whip. It also belongs to later senses that occur in WordNet's annotated texts and have the same parent,
-as both kinds of furniture that "table" means.
+The names of a class are the lemmas of its synset. A lemma after the first is omitted if the annotated texts of WordNet
+use it ten times or more, but never for this synset, such as "head" for a promontory. A hypernym is a synset above one
+or more classes, and at most half of them, because "artifact" and "object" do not separate classes. A lemma of several
+hypernyms belongs to the one whose sense WordNet lists first. Therefore "cat" means the domestic cat, and not the lion
+or the whip. It also belongs to later senses that occur in WordNet's annotated texts and have the same parent, such as
+both kinds of furniture that "table" means.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import normlift_ns
 
 TABLE = Path(normlift_ns.__file__).parent / "encoders" / "imagenet_words.json"
 MANY_USES = 10
-"""Number of uses from which a sense that never occurs is not meant."""
+"""Number of uses from which a sense without any use is omitted."""
 SOURCE = "Made from WordNet 3.0 by research/imagenet_words.py; the license of WordNet:"
 
 
@@ -44,8 +44,10 @@ def read_synsets(folder: Path) -> tuple[dict[str, list[str]], dict[str, list[str
 
 
 def read_senses(folder: Path) -> dict[str, tuple[list[str], int]]:
-    """Return, for every noun in lower case, the offsets of its synsets, the most frequent sense first, and the number
-    of senses that occur in WordNet's annotated texts."""
+    """Return the offsets of the synsets of every noun in lower case, the most frequent sense first.
+
+    Each noun also has the number of senses that occur in WordNet's annotated texts.
+    """
     senses = {}
     for line in (folder / "index.noun").read_text("utf8").splitlines():
         if not line.startswith(" "):

@@ -1,20 +1,21 @@
-"""Inventory of the tabletop, whose twelve objects are known: how many of them are listed, and how much else.
+"""Inventory of the tabletop with twelve known objects: how many are listed, and how many other entries there are.
 
     python -m research.inventory                  exact masks and colors, edges and imagenet; results/inventory.json
     python -m research.inventory --inputs masks   without weights
 
-No name is given. An object is recovered if an entry of the list has an intersection over union of 0.7 with it or more:
-of sampled pixels of the four held-out views, and of Gaussians whose class the exact masks tell. Table and floor are two
-of the twelve. A pixel belongs to the entry that makes up more than half of it. Precision is the number of recovered
-objects per entry of the list, so fragments, duplicates and shadows are errors.
+No name is given. An object is recovered if an entry of the list has an intersection over union of 0.7 or more with it.
+This is computed for sampled pixels of the four held-out views, and for Gaussians with a class by the exact masks. Table
+and floor are two of the twelve objects. A pixel belongs to the entry that makes up more than half of it. Precision is
+the number of recovered objects per entry of the list, so fragments, duplicates and shadows are errors.
 
-The constants of the method were chosen on this capture, in sight of both inputs. With any last affinity of joining from
-0.5 to 0.65, 11 objects are recovered from masks, and 11 or 12 from edges (by pixels); 0.7 is too strict for edges, 0.4
-too lax for both. With edges, the disagreement of the views (0.19 before the consensus, 0.04 after) was chosen last: the
-one after the consensus recovers 6 objects with 20 entries, the one before 9 with 10, and anything from their mean to
-0.16 recovers 12 with 14 or 15. Masks have 11 with 12 in any case.
+The constants of the method were chosen on this capture with both inputs. With any smallest affinity of joining from 0.5
+to 0.65, 11 objects are recovered from masks, and 11 or 12 from edges (by pixels). 0.7 is too strict for edges, and 0.4
+is too low for both. With edges, the disagreement of the views was chosen last (0.19 before the consensus, 0.04 after).
+The value after the consensus recovers 6 objects with 20 entries, and the value before it 9 with 10. Values from their
+mean to 0.16 recover 12 with 14 or 15. With masks, 11 are recovered with 12 entries in all cases.
 
-Keys: <inputs>.pixels and .gaussians recovered objects, .listed, .precision by pixels, .seconds of finding them.
+Keys: <inputs>.pixels and .gaussians, the recovered objects; .listed, the entries; .precision by pixels; .seconds, the
+time of the search.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def main() -> None:
 
 
 def pixel_entries(weights: SparseRows, num_pixels: int, found: Tensor, count: int) -> Tensor:
-    """Return the entry of every pixel, from the weights of Gaussians in pixels [N, P]; 0: none."""
+    """Return the entry of every pixel from the weights of Gaussians in pixels [N, P], or 0 for none."""
     total = torch.zeros(count + 1, num_pixels, dtype=torch.float64)
     total.index_put_((found.long()[weights.row_index()], weights.column.long()), weights.weight.double(), True)
     most = total.max(dim=0)
@@ -78,8 +79,8 @@ def recovered(found: Tensor, truth: Tensor, count: int, classes: int) -> int:
     """Return the number of classes with which an entry has an intersection over union of `MIN_IOU` or more.
 
     Args:
-        found: entry of every place, 1 to `count`; 0: none.
-        truth: class of every place; -1: none.
+        found: Entry of every pixel or Gaussian, 1 to `count`, or 0 for none.
+        truth: Class of every pixel or Gaussian, or -1 for none.
     """
     table = torch.bincount(found.long() * (classes + 1) + truth.long() + 1, minlength=(count + 1) * (classes + 1))
     table = table.view(count + 1, classes + 1).double()

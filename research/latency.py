@@ -1,12 +1,12 @@
-"""How long the viewer's panel takes to answer a prompt on the fox capture once the text is a vector, beside its error.
+"""Time of the viewer's panel for the answer to an encoded prompt on the fox capture, and its error.
 
-    python -m research.latency            45 views; on the GPU if there is one, which --device cpu leaves alone
+    python -m research.latency            45 views; on the GPU if there is one, unless --device cpu is given
     python -m research.latency --quick    4 views, times of 3 runs
 
-The field has 144 grid regions per view and D = 512, in each of its forms: CLIP-like features that differ in every view
-(evidence, float16), and those of 32 classes without noise, which have a basis of rank 32 (low_rank). The question is
-one prompt against four negatives. Times are the least of 20: the machine may be doing other things. The keys panel.*
-are those of `research.panel`, on a lift by colours; --quick leaves them out. `research.view` measures the page.
+The field has 144 grid regions per view and D = 512, in each storage form. CLIP-like features that differ in every view
+use the forms evidence and float16. Features of 32 classes without noise, which have a basis of rank 32, use low_rank.
+The query is one prompt with four negatives. Times are the shortest of 20 runs, to exclude other programs. The keys
+panel.* are those of `research.panel`, on a lift with colors; --quick omits them. `research.view` measures the page.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ REPEATS, CLASSES, SAMPLE = 20, 32, 20_000
 
 
 def least(device: str, repeats: int, action: Callable[[], object]) -> float:
-    """Milliseconds of the fastest of some runs after a first one, the GPU waited for on both sides."""
+    """Return the milliseconds of the fastest of some runs after a warm-up run, with synchronization of the GPU."""
     wait = torch.cuda.synchronize if device == "cuda" else lambda: None
     seconds = []
     for _ in range(repeats + 1):
@@ -58,13 +58,13 @@ def least(device: str, repeats: int, action: Callable[[], object]) -> float:
 
 
 def questions() -> Query:
-    """A prompt that a class of the features has, against four others."""
+    """Return a query with a prompt whose vector some features have, and four negatives."""
     names = np.load(SHARED / "clip_vectors" / "lvis_v1_text.npy").astype(np.float32)
     return Query(("thing",), names[:1], CANONICAL_NEGATIVES, names[10:14], "lerf")
 
 
 def true_relevancy(exact_directions: torch.Tensor, question: Query) -> torch.Tensor:
-    """[M, 1] in float64, from directions in float64."""
+    """Return [M, 1] relevancies in float64, from directions in float64."""
     positive, negative = (
         exact_directions @ torch.nn.functional.normalize(torch.from_numpy(vectors).to(exact_directions), dim=1).T
         for vectors in (question.embeddings, question.negative_embeddings)
@@ -74,7 +74,7 @@ def true_relevancy(exact_directions: torch.Tensor, question: Query) -> torch.Ten
 
 
 def fox_model(device: str) -> NormLiftModel:
-    """The trained Gaussians as ns-viewer has them, panel included."""
+    """Return the model with the trained Gaussians as in ns-viewer, including the panel."""
     state = trained_state("fox")
     degree = math.isqrt(1 + state["gauss_params.features_rest"].shape[1]) - 1
     config = NormLiftModelConfig(num_random=20, sh_degree=degree)
@@ -84,7 +84,7 @@ def fox_model(device: str) -> NormLiftModel:
 
 
 def viewer_camera(camera: Camera) -> Cameras:
-    """The camera as the viewer gives it."""
+    """Return the camera in the form that the viewer passes."""
     pose = camera.world_to_camera.inverse()[:3] * torch.tensor([1.0, -1, -1, 1])
     K = camera.K
     return Cameras(pose[None], K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
@@ -99,10 +99,10 @@ def measure(
     model: NormLiftModel,
     repeats: int,
 ) -> None:
-    """Adds fox_NAME_*: the parts of an answer, and all of it as the panel does it.
+    """Add fox_NAME_*: the times of the parts of an answer, and of the whole answer as in the panel.
 
     Args:
-        exact: relevancy in float64 of some Gaussians.
+        exact: Relevancy in float64 of some Gaussians.
     """
     device, question = model.device.type, questions()
     model.attach(field)

@@ -1,4 +1,4 @@
-"""Licences of the packages that pyproject.toml names, and of weights and words: python -m research.licences"""
+"""Licenses of the packages that pyproject.toml names, and of weights and words: python -m research.licences"""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _USES = {
     "dev": "development",
 }
 _UNSTATED = {"gsplat": "Apache-2.0", "segment-anything": "Apache-2.0", "tomli": "MIT"}
-"""As their repositories state it, of packages whose metadata state none, or that not every Python needs."""
+"""Licenses according to the repositories of packages without license metadata, or that are not installed everywhere."""
 _SHORT = 60
 HEAD = """# Licences
 
@@ -66,7 +66,7 @@ The site contains MathJax (Apache-2.0), which `make docs` fetches from npm.
 
 
 def packages() -> dict[str, str]:
-    """Names of the packages that this one requires, and what for, in alphabetical order."""
+    """Return the required packages with their purpose, in alphabetical order."""
     found: dict[str, str] = {}
     for line in requires("normlift-ns") or []:
         name = re.split(r"[\s<>=!~;\[(]", line)[0].lower().replace("_", "-")
@@ -77,10 +77,11 @@ def packages() -> dict[str, str]:
 
 
 def licence(package: str) -> str:
-    """What an installed package states: an SPDX expression, else its classifiers, else the first line of its text.
+    """Return the license of an installed package: an SPDX expression, else its classifiers, else the first line of its
+    text.
 
     Raises:
-        PackageNotFoundError: it is not installed, and not known otherwise.
+        PackageNotFoundError: If the package is neither installed nor in `_UNSTATED`.
     """
     try:
         stated = metadata(package)
@@ -95,7 +96,7 @@ def licence(package: str) -> str:
 
 
 def page() -> str:
-    """The whole page."""
+    """Return the whole page."""
     table = "".join(f"| {name} | {licence(name)} | {use} |\n" for name, use in packages().items())
     weights = "".join(
         f"- `{name}`, for `{entry.user}`, {entry.size} from {entry.origin}. License: {entry.license}. Training data: "

@@ -1,9 +1,9 @@
-"""What the presets cost in task accuracy: mIoU against that of the default on the same damaged masks of the plain room.
+"""Cost of the presets in accuracy: mIoU relative to that of the default, on the same damaged masks of the plain room.
 
     python -m research.losses      a few minutes on two CPU cores
 
-The default is rasterized at full resolution, lifted and refined in float32. Writes results/losses.json: differences in
-points, means over steps of the ladder and seeds, with 95 % intervals.
+The default is rasterized at full resolution, and lifted and refined in float32. The command writes results/losses.json:
+differences in percentage points, means over steps of the ladder and seeds, with 95 % intervals.
 """
 
 from __future__ import annotations
@@ -34,12 +34,13 @@ from research.variants import Scores, lifted_scores
 
 STEPS, SEEDS = ("noise only", "mild", "hard"), 5
 TOLERANCE = 0.05
-"""Of the preset that is stored in a basis."""
+"""Tolerance of the preset that is stored in a basis."""
 
 
 def coarse_evidence(world: World, observed: Observed, step: int = 2) -> Evidence:
-    """Evidence of the masks of an observation of all views, in images of a fraction of the size: of the pixels that
-    become one, the most frequent mask counts.
+    """Return the evidence of the masks of an observation in smaller images.
+
+    Each side is divided by `step`. The most frequent mask among the pixels that are merged counts.
     """
     view, labels, cameras = observed.evidence.region_view, [], []
     count = torch.bincount(view, minlength=len(world.cameras))
@@ -57,7 +58,7 @@ def coarse_evidence(world: World, observed: Observed, step: int = 2) -> Evidence
 
 
 def miou(world: World, words: Words, observed: Observed, *, low_rank: bool = False) -> float:
-    """Of the whole method, in points; stored in a basis and read again if that is asked."""
+    """Return the mIoU of the whole method in percentage points, with storage in a basis if `low_rank` is True."""
     lifted, config = lift(observed.evidence, observed.features), RefineConfig()
     near = nearest_neighbors(world.scene.means, config.k)
     own, reliability = lifted.scalars.own_evidence, lifted.scalars.reliability
@@ -73,7 +74,7 @@ def miou(world: World, words: Words, observed: Observed, *, low_rank: bool = Fal
 
 
 def every_second_view(observed: Observed) -> Observed:
-    """The observation without every other view."""
+    """Return the observation with every second view."""
     views = list(range(0, observed.evidence.num_views, 2))
     kept: Tensor = observed.evidence.columns_of(views)
     return observed._replace(evidence=observed.evidence.select_views(views), features=observed.features[kept])

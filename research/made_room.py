@@ -1,6 +1,6 @@
-"""Rooms made in code for the benchmarks: surfaces of coloured shapes, faint strays about them, faint floaters.
+"""Rooms made in code for the benchmarks: colored surfaces, faint Gaussians near them, and faint floaters.
 
-A room is a plan: the size of its floor, its parts and a seed.
+A plan describes a room by the size of its floor, its parts and a seed.
 """
 
 from __future__ import annotations
@@ -29,27 +29,30 @@ POINTS_PER_GAUSSIAN = 12
 STRAYS, FLOATERS = 0.08, 0.03
 """Shares of all Gaussians."""
 MIN_THICKNESS = 1e-3
-"""Metres."""
+"""Smallest thickness in meters."""
 
 Part = tuple[str, tuple[float, float, float], float, Distance]
-"""Name, sRGB, Gaussians per square metre relative to the walls, shape."""
+"""Name, sRGB color, density of Gaussians per square meter relative to the walls, and shape."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Of a room."""
+    """Plan of a room."""
 
     length: float
     width: float
     height: float
-    """Of the floor in x and y, and of the walls, metres."""
+    """Height of the walls in meters; `length` and `width` are the sides of the floor along x and y."""
     parts: tuple[Part, ...]
     """All surfaces, one entry per class."""
     seed: int
 
 
 def built(plan: Plan, num_gaussians: int) -> DemoRoom:
-    """Builds a room: surfaces, faint strays about them, faint floaters of no class. Same arguments, same room."""
+    """Build a room: surfaces, faint Gaussians near them, and faint floaters without a class.
+
+    The same arguments give the same room.
+    """
     rng, all_parts = np.random.default_rng(plan.seed), plan.parts
     strays, floaters = int(STRAYS * num_gaussians), int(FLOATERS * num_gaussians)
     means, normals, scales, labels = _surface(plan, num_gaussians - strays - floaters, rng)
@@ -79,7 +82,7 @@ def built(plan: Plan, num_gaussians: int) -> DemoRoom:
 
 
 def _surface(plan: Plan, count: int, rng: np.random.Generator) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Means, normals, scales and classes of Gaussians on all surfaces but those inside other parts."""
+    """Return means, normals, scales and classes of Gaussians on all surfaces that are not inside other parts."""
     all_parts, sides = plan.parts, np.array([plan.length, plan.width])
     low, high = np.array([*(-sides / 2), 0]), np.array([*(sides / 2), plan.height])
     area = 2 * plan.height * sides.sum() + 4 * sides.prod() + 60  # about, each part times its density
@@ -106,7 +109,7 @@ def _surface(plan: Plan, count: int, rng: np.random.Generator) -> tuple[Array, A
 def look(
     place: tuple[float, float, float], target: tuple[float, float, float], width: int, height: int, degrees: float
 ) -> Camera:
-    """A camera at a place, upright, its middle on a target; `degrees` is its horizontal field of view."""
+    """Return an upright camera at a position that faces a target; `degrees` is its horizontal field of view."""
     eye = torch.tensor(place, dtype=torch.float64)
     forward = torch.nn.functional.normalize(torch.tensor(target, dtype=torch.float64) - eye, dim=0)
     right = torch.nn.functional.normalize(forward.cross(eye.new_tensor([0, 0, 1]), dim=0), dim=0)

@@ -20,7 +20,7 @@ class Mesh:
     """Triangles with texture coordinates."""
 
     points: np.ndarray
-    """[n, 3]"""
+    """Positions [n, 3]."""
     uv: np.ndarray
     """[m, 2], in 0..1, v upwards."""
     faces: np.ndarray

@@ -1,8 +1,8 @@
-"""Minutes of the tests by part, for the budget in CONTRIBUTING.md, from what pytest writes with --junitxml.
+"""Minutes of the tests by part, for the budget in CONTRIBUTING.md, from the output of pytest --junitxml.
 
     make test JUNIT=--junitxml=tests.xml; python -m research.minutes tests.xml
 
-They are sums over tests and their fixtures; two processes share them.
+The figures are sums over tests and their fixtures. Two processes share the tests, so the real time is shorter.
 """
 
 import sys
@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 
 def minutes(path: str | Path) -> dict[str, float]:
-    """By folder of tests, or by file where it is in none; the longest first."""
+    """Return minutes by folder of tests, or by file for tests outside of folders; the longest first."""
     seconds: defaultdict[str, float] = defaultdict(float)
     for case in ElementTree.parse(path).iter("testcase"):
         seconds["/".join(case.attrib["classname"].split(".")[:2])] += float(case.attrib["time"])

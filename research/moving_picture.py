@@ -1,9 +1,9 @@
-"""docs/page.webp: ten seconds of ns-normlift-view on the demo room as the trained networks see it, in Chromium.
+"""docs/page.webp: ten seconds of ns-normlift-view on the demo room with the trained networks, in Chromium.
 
-python -m research.moving_picture [config.yml of a lifted run]      after make demo; nothing is saved in the run
+python -m research.moving_picture [config.yml of a lifted run]      after make demo; the run does not change
 
-Somebody types a prompt, points at the answer, asks for a second thing, asks why, isolates the selection, and downloads
-it. The frames are screenshots of the page, each shown for a time that is given here.
+The script types a prompt, hovers over the answer, adds a second prompt, opens the explanation, isolates the selection,
+and downloads it. The frames are screenshots of the page with the durations given here.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from tests.browser.server import OWN, Server
 
 CONFIG = Path("demo/outputs/room/normlift/thing/config.yml")
 PROMPTS = ("wine bottle", ", banana")
-"""What is typed first, and what is added to it."""
+"""First prompt, and the text that is added to it."""
 SIZE, WIDTH = (1200, 750), 1000
-"""Size of the page, and width of the picture."""
+"""Size of the page, and width of the animation."""
 POINTER = """
 const pointer = globalThis.pointer = document.createElement("div");
 const arrow = "M3 2v19l5-5 4 9 4-2-4-8h7z";
@@ -35,11 +35,11 @@ addEventListener("pointermove", ({clientX, clientY}) => {
   [pointer.style.left, pointer.style.top] = [`${clientX - 3}px`, `${clientY - 2}px`];
 }, true);
 """
-"""Draws the pointer, which screenshots do not show."""
+"""Script that draws the pointer, which screenshots do not show."""
 
 
 def main(config: Path) -> None:
-    """Plays the scene and writes the picture."""
+    """Run the scene and write the animation."""
     log = Path(tempfile.mkdtemp()) / "log"
     with chromium() as browser, Server(OWN, config, log).running() as address:
         film = Film(OnPage(browser, address, size=SIZE))
@@ -58,20 +58,20 @@ class Film:
         seen.page.evaluate(POINTER)
 
     def keep(self, milliseconds: int) -> None:
-        """Adds the page as it is now."""
+        """Add a screenshot of the page."""
         image = Image.open(io.BytesIO(self.seen.page.screenshot())).convert("RGB")
         self.frames.append(image.resize((WIDTH, WIDTH * image.height // image.width), Image.Resampling.LANCZOS))
         self.times.append(milliseconds)
 
     def move(self, x: float, y: float, steps: int = 4) -> None:
-        """Moves the pointer in a few frames."""
+        """Move the pointer in a few frames."""
         left, top = self.seen.page.evaluate("[pointer.offsetLeft + 3, pointer.offsetTop + 2]")
         for step in range(1, steps + 1):
             self.seen.page.mouse.move(left + (x - left) * step / steps, top + (y - top) * step / steps)
             self.keep(60)
 
     def press(self, element: str) -> None:
-        """Moves to an element and clicks on it."""
+        """Move to an element and click on it."""
         box = self.seen.page.locator(element).bounding_box()
         assert box is not None
         self.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
@@ -79,7 +79,7 @@ class Film:
         self.seen.page.mouse.up()
 
     def type(self, text: str) -> None:
-        """Types letter by letter, presses Enter and waits for the answer."""
+        """Type letter by letter, press Enter and wait for the answer."""
         before = self.seen.page.evaluate("page.revision")
         for letter in text:
             self.seen.page.keyboard.type(letter)
@@ -89,7 +89,7 @@ class Film:
         self.seen.calm()
 
     def save(self, path: Path) -> None:
-        """Writes an animated WebP that repeats for ever."""
+        """Write an animated WebP that repeats forever."""
         first, *others = self.frames
         how = {"save_all": True, "append_images": others, "duration": self.times, "loop": 0}
         first.save(path, **how, quality=80, method=6, minimize_size=False)
@@ -98,7 +98,7 @@ class Film:
 
 
 def play(film: Film) -> None:
-    """Acts before the page."""
+    """Act on the page, and record the frames."""
     seen = film.seen
     film.keep(500)
     film.press("#prompts")
@@ -124,7 +124,7 @@ def play(film: Film) -> None:
 
 
 def middle(seen: OnPage) -> tuple[float, float]:
-    """Return the place in the page of the colored pixel nearest to the middle of all of them."""
+    """Return the position on the page of the colored pixel nearest to the center of all colored pixels."""
     rows, columns = coloured(seen.shot()).nonzero()
     nearest = ((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2).argmin()
     box = seen.page.locator("#stage").bounding_box()

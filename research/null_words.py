@@ -1,8 +1,8 @@
-"""Write the null vocabulary: names of things that questions about scenes rarely ask for.
+"""Write the null vocabulary: names of objects that queries of scenes rarely contain.
 
     python -m research.null_words     normlift_ns/encoders/null_words.json
 
-The names are those of 200 classes of ImageNet, drawn with a seed from the classes that share no word with the lists of
+The names are those of 200 classes of ImageNet, drawn with a seed. The classes share no word with the lists of
 labels/presence.json, on which the verdicts were measured.
 """
 
@@ -21,7 +21,7 @@ TARGET = Path(__file__).parents[1] / "normlift_ns" / "encoders" / "null_words.js
 
 
 def listed_words() -> list[str]:
-    """Return every text of the lists, visible or absent."""
+    """Return every text of the lists, both visible and absent."""
     table = json.loads(LISTS.read_text())
     captures = [words for lists in table["captures"].values() for words in lists.values()]
     return [*table["imagenet_absent"], *(text for words in captures for texts in words.values() for text in texts)]

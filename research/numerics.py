@@ -1,9 +1,10 @@
-"""Every hard case of the numbers, with its errors against float64 and more: the tables of docs/numerics.md.
+"""Errors of every hard case against float64 or higher precision: the tables of docs/numerics.md.
 
     python -m research.numerics                  on the CPU: results/numerics.json
     python -m research.numerics --device cuda    on a GPU: results/numerics_gpu.json
 
-Fails, after writing, if an error is not within its bound. `python -m research.pages` puts both files side by side.
+After writing, the command fails if an error exceeds its bound. `python -m research.pages` shows both files next to each
+other.
 """
 
 from __future__ import annotations

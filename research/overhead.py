@@ -1,13 +1,13 @@
-"""What a query and a lift cost against another version of the program: as whole commands, run in turns.
+"""Cost of a query and of a lift compared with another version of the program: whole commands, run in turns.
 
     git worktree add ../before b9779a0
     python -m research.overhead --before ../before                  a plain room, 15 runs each
-    python -m research.overhead --before ../before --config FILE    a trained run of your own
+    python -m research.overhead --before ../before --config FILE    another trained run
     python -m research.overhead --before ../before --quick          3 runs of a small room
 
-Both versions run in this Python, one after the other, old and new, so that what the machine does besides meets both.
-Lifts start without caches and leave out the check of photographs against renders, which version 0.1 does not have.
-Spread: half of the distance between the quartiles. Ratio: that of medians of pairs of neighbouring runs.
+Both versions run in this Python in turns, so that other programs on the machine affect both. Lifts start without
+caches, and omit the check of images against renders, which version 0.1 does not have. The spread is half of the
+distance between the quartiles. The ratio is the median over pairs of consecutive runs.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ SOURCE = ("--encoder", "color", "--device", "cpu")
 
 
 class Cost(NamedTuple):
-    """Of one command."""
+    """Cost of one command."""
 
     wall: float
-    """Seconds."""
+    """Wall time in seconds."""
     cpu: float
-    """Seconds of all threads, in user and kernel mode."""
+    """CPU time in seconds of all threads, in user and kernel mode."""
 
 
 def run(
@@ -50,11 +50,11 @@ def run(
     program: str | None = None,
     environment: Mapping[str, str] = {"PYTHONWARNINGS": "ignore"},
 ) -> Cost:
-    """One command of the version in a checkout, in a process of its own.
+    """Run one command of the version in a checkout in a separate process, and return its cost.
 
     Args:
-        program: Python that runs the command; None: its entry point.
-        environment: what is added to that of this process.
+        program: Python code that runs the command, or None for its entry point.
+        environment: Additions to the environment of this process.
     """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(checkout), *_paths()]), **environment}
     program = program or f"from normlift_ns.cli.start import {command}; {command}()"
@@ -74,12 +74,12 @@ def run(
 
 
 def _paths() -> list[str]:
-    """Folders of packages that PYTHONPATH names, but for this checkout."""
+    """Return the folders in PYTHONPATH except for this checkout."""
     return [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path and Path(path) != HERE]
 
 
 def in_turns(checkouts: dict[str, Path], repeats: int, action) -> dict[str, list[Cost]]:
-    """Costs of an action of (name, checkout), after one that does not count; the order changes each time."""
+    """Return the costs of an action of (name, checkout), after a warm-up round; the order alternates."""
     found: dict[str, list[Cost]] = {name: [] for name in checkouts}
     for turn in range(repeats + 1):
         names = list(checkouts) if turn % 2 else list(reversed(checkouts))
@@ -91,13 +91,13 @@ def in_turns(checkouts: dict[str, Path], repeats: int, action) -> dict[str, list
 
 
 def spread(values: list[float]) -> float:
-    """Half of the distance between the quartiles."""
+    """Return half of the distance between the quartiles."""
     low, _, high = statistics.quantiles(values, n=4)
     return (high - low) / 2
 
 
 def demo(folder: Path, gaussians: int) -> Path:
-    """config.yml of a trained plain room."""
+    """Return the config.yml of a trained plain room."""
     from normlift_ns.demo.capture import write_capture, write_splatfacto_run  # noqa: PLC0415 (nerfstudio)
     from tests.plain_room import plain_room  # noqa: PLC0415 (nerfstudio)
 

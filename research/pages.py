@@ -1,10 +1,10 @@
-"""Refreshes the tables of the pages that `PAGES` names, and the plots, from research/results/*.json.
+"""Update of the tables of the pages in `PAGES`, and of the plots, from research/results/*.json.
 
     python -m research.pages            writes tables and plots
-    python -m research.pages --check    writes nothing; fails and names the tables that are out of date, if any are
+    python -m research.pages --check    writes nothing; fails and lists the tables that are out of date, if any
 
 A table stands between the lines `<!-- table: NAME -->` and `<!-- end -->`; `research.tables` has the names. All other
-text of a page is written by hand and stays as it is.
+text of a page is written by hand and does not change.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ LIKE_A_MARKER = re.compile(r"<!--\s*(table|end)\b", re.IGNORECASE)
 
 
 class MarkerError(ValueError):
-    """A marker that is misspelt, names no table, or has no partner."""
+    """Error for a marker that is misspelled, names no table, or has no partner."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Some lines of a page."""
+    """Consecutive lines of a page."""
 
     text: str
     table: str | None = None
-    """The table that they are; None for text written by hand, markers included."""
+    """Name of the table in these lines, or None for text written by hand and for markers."""
 
 
 def split(text: str, names: Collection[str]) -> list[Part]:
-    """The parts of a page, in order; joined, their texts are the page.
+    """Return the parts of a page in order; together, they are the whole page.
 
     Raises:
-        MarkerError: a marker that is misspelt, names no table, or has no partner; the message has its line.
+        MarkerError: If a marker is misspelled, names no table, or has no partner. The message contains its line.
     """
     parts, lines, opened = [], [], None
     for number, line in enumerate(text.splitlines(keepends=True), start=1):
@@ -82,12 +82,12 @@ def split(text: str, names: Collection[str]) -> list[Part]:
 
 
 def outdated(text: str, made: Mapping[str, str]) -> list[str]:
-    """Names of the tables of a page that are not as they are made now."""
+    """Return the names of the tables of a page that are out of date."""
     return [part.table for part in split(text, made) if part.table is not None and part.text != made[part.table]]
 
 
 def refreshed(text: str, made: Mapping[str, str]) -> str:
-    """The page with its tables as they are made now."""
+    """Return the page with current tables."""
     return "".join(part.text if part.table is None else made[part.table] for part in split(text, made))
 
 

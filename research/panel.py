@@ -1,10 +1,10 @@
-"""How long the panel in nerfstudio's viewer takes in Chromium: from pressing Ask until the picture changes.
+"""Time of the panel in nerfstudio's viewer in Chromium, from a press of Ask until the image changes.
 
     python -m research.panel --load-config outputs/room/normlift/demo/config.yml
 
-`python -m research.latency` measures the same on the fox capture, where Chromium is installed. The server draws, so
-the unit names what draws there, and what draws the page in the browser. The time is the least of some prompts after a
-first one, which loads the text encoder.
+`python -m research.latency` measures the same on the fox capture if Chromium is installed. The server renders the
+scene, so the unit names the renderer of the server and that of the page in the browser. The time is the shortest of
+some prompts after a first one, which loads the text encoder.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from research.view import COLOURS, fox_run
 
 SIZE = (1000, 500)
 PATIENCE = 180
-"""Seconds."""
+"""Longest wait in seconds."""
 _BOX: Any = {"x": 100, "y": 60, "width": 500, "height": 400}
-"""Of the page: a part of the picture."""
+"""Part of the page that shows the scene."""
 _PROGRAM = "import sys; from nerfstudio.scripts.viewer.run_viewer import entrypoint; sys.exit(entrypoint())"
 _FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 _RENDERER = """() => {
@@ -46,7 +46,7 @@ _RENDERER = """() => {
 
 @contextmanager
 def served(config: Path) -> Iterator[str]:
-    """Address of an ns-viewer of a run."""
+    """Yield the address of an ns-viewer of a run."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -75,7 +75,7 @@ def picture(page: Any) -> np.ndarray:
 
 
 def settled(page: Any) -> np.ndarray:
-    """The picture once it has been the same for three seconds: the server draws coarsely first."""
+    """Return the image after it has not changed for three seconds, because the server renders coarsely first."""
     before, since = picture(page), time.monotonic()
     while time.monotonic() - since < 3:
         page.wait_for_timeout(300)
@@ -87,7 +87,7 @@ def settled(page: Any) -> np.ndarray:
 
 
 def pressed(address: str, prompts: Sequence[str]) -> tuple[list[float], str]:
-    """Seconds from the press until the picture changes, for every prompt, and what draws the page."""
+    """Return the seconds from the press until the image changes for every prompt, and the renderer of the page."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415 (not installed with the package)
 
     with sync_playwright() as playwright:
@@ -112,7 +112,7 @@ def pressed(address: str, prompts: Sequence[str]) -> tuple[list[float], str]:
 
 
 def add_panel(report: Report, config: Path, prompts: Sequence[str] = COLOURS[:4]) -> None:
-    """Adds panel.press_to_picture_s of a lifted run."""
+    """Add panel.press_to_picture_s of a lifted run."""
     with served(config) as address:
         seconds, name = pressed(address, prompts)
     draws = "gsplat on CUDA" if torch.cuda.is_available() else "Numba on the CPU"
@@ -120,7 +120,7 @@ def add_panel(report: Report, config: Path, prompts: Sequence[str] = COLOURS[:4]
 
 
 def add_fox_panel(report: Report) -> None:
-    """Adds panel.press_to_picture_s of the fox capture, where there is a Chromium."""
+    """Add panel.press_to_picture_s of the fox capture, if Chromium is installed."""
     if shutil.which("chromium") is not None:
         with tempfile.TemporaryDirectory() as folder:
             add_panel(report, fox_run(Path(folder)))
@@ -129,7 +129,9 @@ def add_fox_panel(report: Report) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--load-config", type=Path, help="lifted run; by default the fox capture is lifted first")
-    parser.add_argument("--prompts", nargs="+", default=COLOURS[:4], help="two or more, whose answers look different")
+    parser.add_argument(
+        "--prompts", nargs="+", default=COLOURS[:4], help="two or more prompts whose answers look different"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     found = Report("panel")

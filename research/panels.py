@@ -1,8 +1,8 @@
-"""Panels that explain one answer: image, edges, regions, 2D answer, lifted answer, R, and the reasons.
+"""Panels that explain one answer: image, edges, regions, 2D answer, lifted answer, R, and supporting images.
 
     python -m research.panels RUN/config.yml VIEW --text "red fox" --output panels.png
 
-VIEW is a training image of the lifted run, by name. Regions and features that are not in the run's cache are
+VIEW is the name of a training image of the lifted run. Regions and features that are not in the run's cache are
 computed, which needs the weights of the lift. Both answers have the same colors, and a white line at the threshold.
 """
 
@@ -38,11 +38,10 @@ from normlift_ns.rendering.figures import Display, make_display, pixel_relevancy
 from normlift_ns.segmentation.edges import EdgeRegions
 
 COLUMNS, WIDTH, GAP, TITLE = 4, 3.6, 0.1, 0.32
-"""Panels of a row; width of a panel, gap between panels and height of a title, in inches."""
+"""Number of panels per row, and width of a panel, gap between panels and height of a title in inches."""
 WITNESSES, LARGEST, LEAST = 2, 10, 0.25
-"""Number of images that are shown as reasons, number of images with the largest votes among which those with the best
-agreement are chosen, and smallest vote of an outlined region relative to the largest of its image.
-"""
+"""Numbers that choose supporting images: how many are shown, how many with the largest votes are candidates, and the
+smallest vote of an outlined region relative to the largest of its image. The candidates with the best agreement win."""
 
 
 def main() -> None:
@@ -60,16 +59,16 @@ def main() -> None:
 
 @dataclass(frozen=True)
 class Observed:
-    """A training image as the lift saw it."""
+    """A training image as processed by the lift."""
 
     image: Tensor
-    """[H, W, 3] RGB, 0..255"""
+    """[H, W, 3] RGB, in 0..255."""
     region: Tensor
-    """[H, W] region of every pixel in the (first) level of the lift; -1: none."""
+    """[H, W] region of every pixel in the (first) level of the lift, or -1 for none."""
     features: Tensor
     """[R, D] unit rows."""
     cells: Tensor
-    """[H, W]"""
+    """[H, W] cell of every pixel, or -1 for none."""
     regions: Tensor
     """[levels, C] region of every cell."""
 

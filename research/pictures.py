@@ -1,10 +1,10 @@
-"""The plain room at step "hard" of the ladder of damage, every pixel in the colour of its class.
+"""The plain room at step "hard" of the ladder of damage, with every pixel in the color of its class.
 
 python -m research.pictures      docs/refinement.png and docs/consensus.png
 
-The first shows a held-out view: the truth, the lift, and the lift refined. The second shows a training view, the one
-whose regions gain more than those of half of the others: its truth, and what its regions are taken for before and after
-the consensus; and the held-out view: the lift, with consensus, and with consensus and the posterior vote.
+The first figure shows a held-out view: the truth, the lift, and the refined lift. The second figure shows the training
+view with the median gain of the consensus: its truth, and the classes of its regions before and after the consensus. It
+also shows the held-out view: the lift, the lift with consensus, and the lift with consensus and posterior vote.
 """
 
 from __future__ import annotations
@@ -29,15 +29,14 @@ from research.variants import Scores, lifted_scores, refined_scores
 from tests.plain_room import plain_room
 
 STEP, SEED, VIEW = "hard", 0, 0
-"""The view is one of those held out."""
+"""Damage step, seed, and index of the held-out view."""
 Panel = tuple[str, Tensor]
-"""Title, and [H, W] class of every pixel, -1 for none."""
+"""Title, and [H, W] class of every pixel, or -1 for none."""
 
 
 def of_regions(world: World, observed: Observed, features: Tensor, classes: Tensor) -> tuple[Tensor, list[float]]:
-    """[V, H, W] what the regions of the training views are taken for, and the share of labelled pixels of each view
-    where that is right.
-    """
+    """Return [V, H, W] classes of the regions of the training views, and the share of correct labeled pixels per
+    view."""
     region, truth = observed.columns[0][world.cells.of_pixel.long()], world.cells.maps
     found = torch.where(region >= 0, (features @ classes.T).argmax(dim=1)[region.clamp(min=0)], -1)
     known = (region >= 0) & (truth >= 0)
@@ -45,7 +44,7 @@ def of_regions(world: World, observed: Observed, features: Tensor, classes: Tens
 
 
 def held_out_panel(title: str, world: World, scores: Scores) -> Panel:
-    """The held-out view, and its mIoU."""
+    """Return the panel of the held-out view with its mIoU."""
     truth = world.held_out_maps[VIEW]
     values, alpha = render(world.scene, world.held_out[VIEW], scores.cosine)
     found = classify(values.flatten(0, 1), alpha.flatten() > 0).view(alpha.shape)
@@ -54,7 +53,7 @@ def held_out_panel(title: str, world: World, scores: Scores) -> Panel:
 
 
 def draw(name: str, palette: NDArray[np.float64], panels: Sequence[Panel]) -> None:
-    """Three panels in every row, as docs/NAME."""
+    """Draw rows of three panels as docs/NAME."""
     rows = len(panels) // 3
     figure = Figure(figsize=(12, 3.4 * rows), layout="constrained")
     for axes, (title, labels) in zip(figure.subplots(rows, 3).flat, panels):

@@ -1,12 +1,12 @@
-"""What a plan tells against what a lift takes: whole commands, ns-normlift-check and then ns-normlift.
+"""Estimates of a plan compared with the times of a lift, with the commands ns-normlift-check and ns-normlift.
 
     python -m research.planning                                  the fox and the tabletop, on the GPU if there is one
     python -m research.planning --load-config FILE --device cpu  another run, on a device
-    python -m research.planning --quick                          colours, and 8 views
+    python -m research.planning --quick                          colors, and 8 views
 
-Each front end is planned and lifted twice: from nothing, and with everything cached. Superpixels are told by colours;
-patches by CLIP's ViT-B-16 with random weights, which take as long as trained ones. Nothing is downloaded. The results
-of the two kinds of machine have a file each.
+Each front end is planned and lifted twice: with empty caches, and with everything cached. Superpixels use colors.
+Patches use CLIP's ViT-B-16 with random weights, which take as long as trained ones. Nothing is downloaded. The results
+of the two kinds of machine are in separate files.
 """
 
 from __future__ import annotations
@@ -27,7 +27,11 @@ CAPTURES = ("fox", "tabletop")
 
 
 def planned(trained: Path, folder: Path, name: str, *flags: object) -> dict[str, float]:
-    """Seconds of every stage and `total`, as the check tells them; `wall`: what the check took."""
+    """Return the estimates of a check and its own time.
+
+    The keys are the stages and `total` in seconds, `wall` for the time of the check itself, and `gib` and `gpu_gib` for
+    memory.
+    """
     file = folder / "plan.json"
     given = (
         "--load-config",
@@ -49,7 +53,7 @@ def planned(trained: Path, folder: Path, name: str, *flags: object) -> dict[str,
 
 
 def add_case(report: Report, trained: Path, folder: Path, name: str, *flags: object) -> None:
-    """A plan and a lift from nothing, and again with everything cached."""
+    """Add a plan and a lift with empty caches, and again with everything cached."""
     for state in ("first", "cached"):
         told, taken = planned(trained, folder, name, *flags), lifted(trained, folder, name, *flags)
         newest = max((folder / name).rglob("manifest.json"), key=lambda path: path.stat().st_mtime)
@@ -90,7 +94,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--load-config", type=Path, help="config.yml of a trained run; by default fox and tabletop")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--quick", action="store_true", help="colours only, 8 views")
+    parser.add_argument("--quick", action="store_true", help="colors only, 8 views")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     outputs = SHARED / "captures" / "outputs"

@@ -14,11 +14,11 @@ from research.signals import STEP
 
 DOCS = Path(__file__).parents[1] / "docs"
 FLOOR = 1e-4
-"""Where an error of 0 is drawn."""
+"""Value at which an error of 0 is drawn."""
 
 
 def plots(found: Documents, folder: Path) -> Iterator[Path]:
-    """Draws all of them, and names the files."""
+    """Draw all plots, and yield their paths."""
     accuracy, fit, signals = (found[name] for name in ("accuracy", "fit", "signals"))
     yield plot_presets(found["presets"], folder / "presets.svg")
     yield plot_accuracy(accuracy, folder / "accuracy.svg")
@@ -38,7 +38,7 @@ def plots(found: Documents, folder: Path) -> Iterator[Path]:
 
 
 def plot_presets(document: Document, target: Path) -> Path:
-    """Time against error over the presets of a lift."""
+    """Plot time against error over the presets of a lift."""
     v = document.values
     mpl.rcParams["svg.hashsalt"] = "presets"
     figure = Figure(figsize=(8, 4.5), layout="constrained")
@@ -55,7 +55,7 @@ def plot_presets(document: Document, target: Path) -> Path:
 
 
 def plot_accuracy(document: Document, target: Path) -> Path:
-    """mIoU of every variant on every step of the ladder, tabletop."""
+    """Plot the mIoU of every variant on every step of the ladder, for the tabletop."""
     names = steps(document)
     mpl.rcParams["svg.hashsalt"] = "accuracy"
     figure = Figure(figsize=(9, 4.5), layout="constrained")
@@ -76,7 +76,7 @@ def plot_accuracy(document: Document, target: Path) -> Path:
 
 
 def plot_drift(document: Document, target: Path) -> Path:
-    """Share of pairs whose mixture is nearest to a third class, by the share of one of the two, tabletop."""
+    """Plot the share of pairs whose mixture is nearest to a third class, by the mixing ratio, for the tabletop."""
     mpl.rcParams["svg.hashsalt"] = "drift"
     figure = Figure(figsize=(6, 3.5), layout="constrained")
     axes = figure.subplots()

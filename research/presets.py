@@ -1,10 +1,11 @@
-"""What speed costs in accuracy: presets of the lift on one GPU, each against the same lift in float64.
+"""Accuracy of faster presets of the lift on one GPU, each compared with the same lift in float64.
 
     python -m research.presets
 
-Scene: the fox capture, every third training view, grid regions. A region has the class of the place that it shows, one
-of 40, that is a CLIP text vector with noise of length 0.5 in every view. The error of a preset is the length of the
-difference between its refined direction and that of float64, per Gaussian that has one there.
+The scene is the fox capture with every third training view and grid regions. A region has one of 40 classes, that of
+the place in its middle. Its feature is the CLIP text vector of the class with noise of length 0.5 in every view. The
+error of a preset is the length of the difference between its refined direction and that of float64, for each Gaussian
+with a direction in float64.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ from tests.captures import SHARED
 
 class Outcome(NamedTuple):
     directions: torch.Tensor
-    """Refined, [N, D]."""
+    """Refined directions, [N, D]."""
     known: torch.Tensor
 
 
 def world_features(case: Case) -> torch.Tensor:
-    """[S, 512] rows: the class of the place that the middle of a region shows, with noise."""
+    """Return [S, 512] rows: the class vector of the place in the middle of each region, with noise."""
     from normlift_ns import render  # noqa: PLC0415
 
     g = torch.Generator().manual_seed(0)
@@ -56,7 +57,7 @@ def world_features(case: Case) -> torch.Tensor:
 
 
 def run(case: Case, table: torch.Tensor, precision: str) -> tuple[Outcome, Any]:
-    """One whole lift: evidence, lift, neighbours, vote."""
+    """Run one whole lift: evidence, lift, neighbors and vote."""
     exact = precision == "exact"
     dtype = torch.float64 if exact else torch.float32
     evidence = case.evidence(dtype=dtype)
@@ -82,7 +83,7 @@ def run(case: Case, table: torch.Tensor, precision: str) -> tuple[Outcome, Any]:
 
 
 def low_rank(case: Case, table: torch.Tensor) -> tuple[Outcome, Any]:
-    """The default lift, stored in a basis that changes no cosine by more than 5e-2."""
+    """Return the default lift, stored in a basis that changes no cosine by more than 5e-2."""
     _, (lifted, source) = run(case, table, "float32")
     field = SemanticField.build(lifted, case.scene.means, source, tolerance=5e-2, storage="low_rank")
     return Outcome(field.directions(), field.valid()), None

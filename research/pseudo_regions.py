@@ -1,6 +1,7 @@
-"""Regions that are no things: superpixels, a grid and patches of rendered pictures, with features of what they show.
+"""Regions that do not follow objects: superpixels, a grid and patches of rendered images, with features of their
+content.
 
-What goes wrong with masks (merged, split, shifted, frayed) cannot go wrong with pieces of the picture itself. Left are
+Most damage of masks (merged, split, shifted, frayed) does not apply to pieces of an image. The remaining kinds are
 noise, wrong classes, missing pieces and few views.
 """
 
@@ -31,24 +32,24 @@ from research.synthetic_scenes import Words, World
 
 KINDS = ("superpixels", "grid", "patches")
 COUNT = {"superpixels": 256, "grid": 256, "patches": 1024}
-"""Per image, the defaults of the sources."""
+"""Default number of pieces per image of each source."""
 AROUND = (0.5, 1.0, 0.5)
-"""How much a patch shows of the patches before it, of itself and of those after it, across and down: the network that
-encodes it looks at its neighbours too."""
+"""Weights with which a patch shows the patch before it, itself and the patch after it, along both axes, because a
+network also uses the surroundings of a patch."""
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """A world cut into pieces."""
+    """A world divided into pieces."""
 
     world: World
     kind: str
     evidence: Evidence
-    """One column per piece."""
+    """Evidence with one column per piece."""
     content: Tensor
-    """[S, K + 1] share of every class among the pixels that the piece's feature is of, the background last."""
+    """[S, K + 1] share of every class among the pixels that the feature of a piece covers, with the background last."""
     labels: list[Tensor]
-    """[H, W] piece of every pixel of a view, counted through all views."""
+    """[H, W] piece of every pixel of each view, numbered through all views."""
 
     @cached_property
     def looks(self) -> Looks:
@@ -64,10 +65,10 @@ class Pieces:
 
 
 def pieces(world: World, kind: str, count: int | None = None) -> Pieces:
-    """Cuts the rendered pictures of all training views.
+    """Divide the rendered images of all training views into pieces.
 
     Args:
-        count: pieces per image; the source's default if None.
+        count: Number of pieces per image (default: that of the source).
     """
     assert world.colors is not None, world.name
     count = count or COUNT[kind]
@@ -88,7 +89,7 @@ def pieces(world: World, kind: str, count: int | None = None) -> Pieces:
 
 
 def label_map(kind: str, image: Tensor, count: int) -> Tensor:
-    """[H, W] int32 piece of every pixel of a picture [H, W, 3], as the package's own sources cut it."""
+    """Return [H, W], the int32 piece of every pixel of an image [H, W, 3], as in the package's own sources."""
     if kind == "patches":
         rows, columns = patch_grid(image.shape[0], image.shape[1], count)
         patches = torch.arange(rows * columns, dtype=torch.int32).view(1, rows, columns).numpy()
@@ -98,14 +99,14 @@ def label_map(kind: str, image: Tensor, count: int) -> Tensor:
 
 
 def shares_of(labels: Tensor, classes: Tensor, number: int, count: int) -> Tensor:
-    """[number, K + 1] share of every class, -1 last, among the pixels of each piece."""
+    """Return [number, K + 1], the share of every class among the pixels of each piece, with the background last."""
     what = one_hot(torch.where(classes >= 0, classes, count).flatten(), count + 1).float()
     sums = torch.zeros(number, count + 1).index_add_(0, labels.flatten().long(), what)
     return sums / sums.sum(1, keepdim=True).clamp(min=1)
 
 
 def blurred(shares: Tensor, grid: tuple[int, int]) -> Tensor:
-    """What patches [rows * columns, K + 1] show together with their neighbours; see `AROUND`."""
+    """Return the content of patches [rows * columns, K + 1] mixed with that of their neighbors; see `AROUND`."""
     line = torch.tensor(AROUND)
     planes = shares.T.reshape(-1, 1, *grid)
     kernel = (line[:, None] * line)[None, None]
@@ -116,8 +117,9 @@ def blurred(shares: Tensor, grid: tuple[int, int]) -> Tensor:
 def observe_pieces(
     found: Pieces, words: Words | Looks, damage: Damage, seed: int, lengths: Lengths | None = None
 ) -> Observed:
-    """What a lift gets of the pieces after noise, wrong classes, missing pieces and few views; the same arguments give
-    the same result.
+    """Return the input of a lift from the pieces after noise, wrong classes, missing pieces and few views.
+
+    The same arguments give the same result.
     """
     g = torch.Generator().manual_seed(seed)
     world, content = found.world, found.content

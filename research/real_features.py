@@ -1,17 +1,17 @@
-"""Features like those of a trained network on photographs: made-up vectors with the same cosines.
+"""Synthetic features with the same cosines as those of a trained network on photographs.
 
-`research.geometry` measured these on the fox, in regions between learned edges with ImageNet's classifier. A thing has
-several parts, each a region of its own. The feature of a part in a view is the normalized sum of
+`research.geometry` measured the cosines on the fox, in regions between learned edges with ImageNet's classifier. An
+object has several parts, each a region of its own. The feature of a part in a view is the normalized sum of
 
-* a direction that all features share, one of the thing and one of the part, all orthogonal to the texts;
+* a direction that all features share, one of the object and one of the part, all orthogonal to the texts;
 * the text of the class, longer in some parts than in others, and the text of one other class that is the same
   in all views: the best wrong text;
-* two random directions that turn as the camera moves around the thing, one of the whole thing and one of the part.
-  Their correlation between two views is exp(-angle / scale): views from nearby show almost the same mistakes;
+* two random directions that turn as the camera moves around the object, one of the whole object and one of the part.
+  Their correlation between two views is exp(-angle / scale), so that nearby views have almost the same mistakes;
 * noise of this region in this view.
 
-The last two are as long as measured where a damage has noise `NOISE`, and in proportion to it elsewhere. Texts are
-orthogonal, as the class vectors of such a network are. Squared lengths are differences of the measured cosines.
+The lengths of the last two are as measured for a damage with noise `NOISE`, and proportional to the noise otherwise.
+Texts are orthogonal, like the class vectors of such a network. Squared lengths are differences of the measured cosines.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from research.features import mistaken
 from research.synthetic_scenes import PARTS, Words
 
 NOISE = 1.2
-"""Of the step "noise only"."""
+"""Noise of the step "noise only"."""
 
 
 @dataclass(frozen=True)
 class Cosines:
-    """Between features, the mean over pairs; keys of results/geometry.json in brackets."""
+    """Means of cosines between features over pairs, with their keys in results/geometry.json in brackets."""
 
     two_things: float = 0.217
-    """In two views. [two_things.two_views]"""
+    """Of two objects, in two views. [two_things.two_views]"""
     two_parts: float = 0.325
-    """Of a thing, in two views. [thing.two_views]"""
+    """Of two parts of an object, in two views. [thing.two_views]"""
     two_parts_one_view: float = 0.399
-    """[thing.one_view]"""
+    """Of two parts of an object, in one view. [thing.one_view]"""
     far: float = 0.390
-    """Of one part, from opposite sides. [far]"""
+    """Of one part, from opposite directions. [far]"""
     near: float = 0.770
-    """Of one part, from almost the same place. [near]"""
+    """Of one part, from almost the same position. [near]"""
     scale: float = 21.7
-    """Degrees of the angle between the views. [scale]"""
+    """Angle between the views in degrees over which the cosine decays. [scale]"""
     own: float = 0.076
     """Of a feature and its text. [own]"""
     wrong: float = 0.045
     """Of a feature and the best wrong text among 11. [wrong]"""
     spread: float = 0.382
-    """Standard deviation of the cosine with the own text within a thing, as a share of it. [spread]"""
+    """Standard deviation of the cosine with the own text within an object, relative to this cosine. [spread]"""
 
 
 FOX = Cosines()
@@ -58,27 +58,27 @@ FOX = Cosines()
 
 @dataclass(frozen=True)
 class Regions:
-    """Masks of parts of things."""
+    """Masks of parts of objects."""
 
     view: Tensor
-    """[S]"""
+    """[S] view."""
     thing: Tensor
     """[S] class."""
     part: Tensor
-    """[S] in 0..PARTS-1."""
+    """[S] part, in 0..PARTS-1."""
     forced: Tensor
-    """[S] class that a region shows whatever else is drawn, -1: none."""
+    """[S] class that a region shows in any case, or -1 for none."""
 
 
 def real_features(
     words: Words, regions: Regions, angles: Tensor, wrong: float, noise: float, g: torch.Generator, like: Cosines = FOX
 ) -> Tensor:
-    """[S, D] unit.
+    """Return [S, D] unit features.
 
     Args:
-        angles: [K, V, V] degrees between the directions in which two views see each thing.
-        wrong: share of regions that show another class.
-        noise: length of a damage's noise.
+        angles: [K, V, V] angles in degrees between the directions in which two views show each object.
+        wrong: Share of regions that show another class.
+        noise: Length of the noise of a damage.
     """
     (count, dimension), views = words.classes.shape, angles.shape[1]
     thing, part = regions.thing, regions.part

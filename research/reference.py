@@ -1,6 +1,6 @@
-"""Every option of every command, its default and its range, from the code: python -m research.reference
+"""Reference of every option of every command, with defaults and ranges, from the code: python -m research.reference
 
-Writes docs/options.md. A test compares the page with the code, and its flags with the help of the commands.
+The command writes docs/options.md. A test compares the page with the code, and its flags with the help of the commands.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ _KINDS = {Path: "a path", str: "a text", bool: "`True`, `False`"}
 
 
 def page() -> str:
-    """The whole page."""
+    """Return the whole page."""
     return HEAD.format(flags=_text(OUTPUT_FLAGS_HELP)) + "".join(
         section(name, command) for name, command in COMMANDS.items()
     )
 
 
 def section(name: str, command: type) -> str:
-    """The options of one command; of a command that has those of ns-normlift too, its own."""
+    """Return the options of one command, or of a command that inherits those of ns-normlift, only its own."""
     inherited = {field.name for field in dataclasses.fields(NormLift)} if command is not NormLift else set()
     inherits = issubclass(command, NormLift) and command is not NormLift
     fields = [f for f in dataclasses.fields(command) if not (inherits and f.name in inherited)]
@@ -100,7 +100,7 @@ def _rows(options: Any, names: list[str]) -> Iterator[str]:
 
 
 def _text(text: str) -> str:
-    """A docstring in one line of Markdown, flags as code."""
+    """Return a docstring in one line of Markdown, with flags as code."""
     line = " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
     return re.sub(r"(?<![\w-])--[a-z][a-z0-9-]*", r"`\g<0>`", line)
 
@@ -115,7 +115,7 @@ def _default(field: dataclasses.Field[Any]) -> str:
 
 
 def _values(name: str, hint: Any) -> str:
-    """What an option may be, in words."""
+    """Return the accepted values of an option, in words."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Literal:
         return ", ".join(f"`{word}`" for word in parts)
@@ -134,7 +134,7 @@ def _values(name: str, hint: Any) -> str:
 
 
 def _bare(hint: Any) -> Any:
-    """A type without what tyro is told about it."""
+    """Return a type without its annotations for tyro."""
     return _bare(get_args(hint)[0]) if get_origin(hint) is Annotated else hint
 
 

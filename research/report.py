@@ -22,7 +22,7 @@ from rich.table import Table
 
 RESULTS = Path(__file__).parent / "results"
 NAMED = ("--quick", "--statistic", "real", "--clip")
-"""Arguments that a report names."""
+"""Arguments that a report includes."""
 PACKAGES = ("torch", "triton", "numpy", "scipy", "numba", "gsplat", "transformers")
 
 
@@ -32,7 +32,7 @@ class Metric:
     value: float
     unit: str
     error: float | None = None
-    """Relative error against float64 of the result that took this time, where there is one."""
+    """Relative error against float64 of the timed result, or None if it was not measured."""
 
 
 @dataclass
@@ -65,20 +65,20 @@ class Report:
 
 
 def as_text(document: Mapping[str, Any]) -> str:
-    """The document as JSON: every entry of the header on one line, and every metric on one line."""
+    """Return the document as JSON with one line per entry of the header and per metric."""
     header = [f" {json.dumps(key)}: {json.dumps(value)}," for key, value in document.items() if key != "metrics"]
     metrics = ",\n".join(f"  {json.dumps(metric, allow_nan=False)}" for metric in document["metrics"])
     return "\n".join(["{", *header, ' "metrics": [', metrics, " ]", "}"]) + "\n"
 
 
 def _row(metric: Metric) -> dict[str, Any]:
-    """The metric as JSON has it, with null for what is not a finite number."""
+    """Return the metric for JSON, with null for numbers that are not finite."""
     numbers = {"value": metric.value, "error": metric.error}
     return asdict(metric) | {key: x if x is not None and math.isfinite(x) else None for key, x in numbers.items()}
 
 
 def hardware() -> str:
-    """CPU and cores, and the GPU if there is one."""
+    """Return the CPU and its cores, and the GPU if there is one."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     cpu = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())

@@ -1,4 +1,4 @@
-"""Finished parts of a long run, one JSON line each: a run that was stopped goes on where it was."""
+"""Finished parts of a long run, one JSON line each, so that an interrupted run can continue."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any
 
 
 class RowsError(ValueError):
-    """A file of rows that cannot be gone on with."""
+    """Error for a file of rows that cannot be continued."""
 
 
 def read_rows(path: Path, run: dict[str, Any]) -> list[dict[str, Any]]:
-    """The rows in a file that is made if there is none; a half-written last line is cut off.
+    """Return the rows of a file, which is created if it does not exist. An incomplete last line is removed.
 
     Args:
-        run: what all rows must have in common, the first line of the file.
+        run: Settings that all rows share, which are the first line of the file.
     Raises:
-        RowsError: rows of another run, or a damaged line that is not the last.
+        RowsError: If the rows are from another run, or a complete line is damaged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     content = path.read_bytes() if path.exists() else b""
@@ -34,17 +34,19 @@ def read_rows(path: Path, run: dict[str, Any]) -> list[dict[str, Any]]:
         try:
             found.append(json.loads(line))
         except json.JSONDecodeError as error:
-            raise RowsError(f"{path}, line {number} is no JSON ({error}); delete the line, or the file") from error
+            raise RowsError(
+                f"{path}, line {number} is not valid JSON ({error}); delete the line, or the file"
+            ) from error
     if found[0] != json.loads(json.dumps(run)):
         raise RowsError(
-            f"{path} holds rows of another run, {json.dumps(found[0])[:300]}; expected {json.dumps(run)[:300]}; give "
-            "another file: --rows PATH"
+            f"{path} contains rows of another run, {json.dumps(found[0])[:300]}; expected {json.dumps(run)[:300]}; "
+            "give another file: --rows PATH"
         )
     return found[1:]
 
 
 def append(path: Path, row: dict[str, Any]) -> None:
-    """Adds a line in one piece, whoever else writes."""
+    """Add a line in a single write, so that several processes can add lines."""
     line = (json.dumps(row) + "\n").encode()
     file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
     try:

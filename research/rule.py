@@ -1,38 +1,39 @@
-"""How defaults are chosen: a frozen grid of cells and a rule, written down before anything was run on it.
+"""Rule for the choice of defaults on a frozen grid of cells, written down before anything was run on it.
 
 A **cell** is a combination of scene, kind of region, statistic of features, damage and number of views. Its value for a
-variant is the mean mIoU over Gaussians, in points, of its 4 seeds, the same for all variants; a variant's **loss** in a
-cell is the value of `none` less its own. Cells count equally. Seeds are 1000 to 1003, which no earlier fit, table or
-test has seen.
+variant is the mean mIoU over Gaussians, in percentage points, of 4 seeds that all variants share. The **loss** of a
+variant in a cell is the value of `none` minus its own. Cells count equally. The seeds are 1000 to 1003, which no
+earlier fit, table or test used.
 
 *Scenes.* Choices are made on the tabletop and the plain room. Two more rooms (`research.second_room` and
-`research.third_room`) confirm or refute what was chosen and are never looked at for a choice.
+`research.third_room`) confirm or refute the choice, and are never used to choose.
 
-*History.* At first there was the second room alone, and it refuted the first choice, consensus with power 2: better by
-2.8 points there, but worse in 7 % of the cells and in a third of those with dropped masks, which was the worst column
-of the scenes of the choice as well. The consensus was then changed: pixels without a region count as seen. Because the
-second room had been looked at, the third was written, before the changed consensus was run on the grid; scenes of the
-choice, candidates, clauses and limits stayed as they were.
+*History.* At first, only the second room existed. It refuted the first choice, consensus with power 2. That choice was
+better by 2.8 points there, but worse in 7 % of the cells, and in a third of those with dropped masks, the worst column
+also in the scenes of the choice. The consensus was then changed, so that pixels without a region count as seen. Because
+the second room had been examined, the third room was written before the changed consensus was run on the grid. Scenes
+of the choice, candidates, clauses and limits did not change.
 
-*Cells of masks*: 15 damages (`damage.STEPS`) x all, 6 and 3 views x 5 statistics (`features.STATISTICS`), but for
+*Cells of masks*: 15 damages (`damage.STEPS`) x all, 6 and 3 views x 5 statistics (`features.STATISTICS`), except for
 
-* step "few views", which has its own 4 views and is step "mild" with fewer: one cell per statistic, views "4";
-* step "noise" of histograms: they have no noise but the picture's, so that it would be step "mild" again.
+* step "few views", which is step "mild" with its own 4 views: one cell per statistic, views "4";
+* step "noise" of histograms, whose only noise is that of the image, so that it would equal step "mild".
 
-*Cells of superpixels, grid and patches*: damages of masks that are made by an outline (merged, split, shifted, pose,
-group) and of a camera or the scene (dominant view, floaters) have no meaning of their own for pieces of the picture, or
-say nothing else than they do for masks; arc needs things. There remain "noise only", "mild", "noise", "wrong classes",
-"dropped masks" and "few views", of which pieces feel the noise, the wrong classes, the missing pieces and the views.
-Statistics are CLIP-like and histograms: isotropic, low contrast and orthogonal ones are left out to keep the run within
-minutes, because what distinguishes pieces is what they show, and these two span it from a word to a picture.
+*Cells of superpixels, grid and patches* use the steps "noise only", "mild", "noise", "wrong classes", "dropped masks"
+and "few views". They affect pieces by noise, wrong classes, missing pieces and numbers of views. Damages of outlines
+(merged, split, shifted, pose, group) do not apply to pieces of an image, and those of a camera or the scene (dominant
+view, floaters) have the same effect as for masks. Arc needs objects. Statistics are CLIP-like and histograms.
+Isotropic, low contrast and orthogonal ones are omitted to keep the run within minutes: the content of a piece matters,
+and these two statistics range from words to images.
 
-*Statistic real* (`research.real_features`) came later, when a trained network had been measured on photographs. Its
-cells are those of masks again, 43 per scene, but regions are parts of objects. They are run and shown next to the
-others (`research.grid --statistic real`). They have no part in a decision: its grid stays as it was.
+*Statistic real* (`research.real_features`) was added after a trained network had been measured on photographs. Its
+cells are those of masks, 43 per scene, but regions are parts of objects. They are run and shown next to the others
+(`research.grid --statistic real`). They do not affect a decision, whose grid did not change.
 
 That is 212 cells of masks and 87 of pieces per scene, 299 x 4 x 4 seeds = 4,784 observations.
 
-*Candidates* are those of `candidates.CANDIDATES`. One is **eligible** if, on the cells of tabletop and plain room,
+*Candidates* are those of `candidates.CANDIDATES`. A candidate is **eligible** if, on the cells of tabletop and plain
+room,
 
 1. undamaged (step "noise only" with all views, every statistic and kind of region), it loses at most 0.2 points on
    average,
@@ -40,15 +41,15 @@ That is 212 cells of masks and 87 of pieces per scene, 299 x 4 x 4 seeds = 4,784
 3. it is worse than `none` by more than 1 point in at most 5 % of all cells, and
 4. in at most 20 % of the cells of any damage, and of any number of views.
 
-The **default** is the eligible candidate with the best mean over all these cells; of equal ones the earlier in the
-table. `none` is a candidate; it loses nothing, so that it is the default where no other is eligible.
+The **default** is the eligible candidate with the best mean over all these cells, and the earlier in the table among
+equal ones. `none` is a candidate without loss, so it is the default if no other candidate is eligible.
 
-A room **refutes** the default if there it is not better than `none` on average, or breaks clause 1, 2 or 3, or clause 4
-by more than one cell of a column (columns of one scene have as few as 11 cells, of which one is 9 %). One room is
-enough. `none` cannot be refuted. If the default is refuted, `none` takes its place, and the pages say so; no second
-choice is made, because the room would have been part of it.
+A room **refutes** the default if, in this room, the default is not better than `none` on average, or breaks clause 1, 2
+or 3, or clause 4 by more than one cell of a column (columns of one scene have as few as 11 cells, of which one is 9 %).
+One room is enough. `none` cannot be refuted. If the default is refuted, `none` replaces it, and the pages report this.
+No second choice is made, because it would depend on the room.
 
-On a CPU a sample of Gaussians votes and counts; the decision is the one of a run in which all do.
+On a CPU, a sample of Gaussians votes and counts. Only a run with all Gaussians decides.
 """
 
 from __future__ import annotations
@@ -68,38 +69,38 @@ FEW = "few views"
 PIECE_DAMAGES = ("noise only", "mild", "noise", "wrong classes", "dropped masks", FEW)
 PIECE_STATISTICS = ("clip", "histogram")
 REAL = "real"
-"""Statistic of cells that decide nothing."""
+"""Statistic of cells that do not affect decisions."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Of a default."""
+    """Limits of an eligible default."""
 
     undamaged: float = 0.2
-    """Points."""
+    """Largest mean loss without damage, in percentage points."""
     three_views: float = 1.0
-    """Points."""
+    """Largest mean loss with 3 views, in percentage points."""
     worse: float = 1.0
-    """Points by which a cell is worse."""
+    """Loss in percentage points above which a cell counts as worse."""
     overall: float = 0.05
-    """Share of all cells."""
+    """Largest share of all cells that are worse."""
     column: float = 0.2
-    """Share of the cells of a damage or a number of views."""
+    """Largest share of worse cells for a damage or a number of views."""
 
 
 LIMITS = Limits()
 
 
 class Cell(NamedTuple):
-    """A place in the grid."""
+    """A cell of the grid."""
 
     scene: str
     kind: str
-    """masks, superpixels, grid, patches"""
+    """"masks", "superpixels", "grid" or "patches"."""
     statistic: str
     damage: str
     views: str
-    """all, 6, 3, or 4 for step "few views"."""
+    """"all", "6" or "3", or "4" for step "few views"."""
 
     @property
     def undamaged(self) -> bool:
@@ -107,17 +108,17 @@ class Cell(NamedTuple):
 
     @property
     def limit(self) -> int | None:
-        """Number of views, None for all."""
+        """Number of views, or None for all."""
         return STEPS[FEW].views if self.damage == FEW else VIEWS[self.views]
 
 
 def real_cells_of(scene: str) -> list[Cell]:
-    """The cells of a scene with statistic real, beside the grid."""
+    """Return the cells of a scene with statistic real, which are not part of the grid."""
     return [cell._replace(statistic=REAL) for cell in cells_of(scene) if cell[1:3] == ("masks", "clip")]
 
 
 def cells_of(scene: str) -> list[Cell]:
-    """The cells of a scene."""
+    """Return the cells of a scene."""
     found = []
     for kind in ("masks", *KINDS):
         things = kind == "masks"
@@ -130,7 +131,7 @@ def cells_of(scene: str) -> list[Cell]:
 
 
 def damage_of(cell: Cell) -> Damage:
-    """The damage with the cell's number of views."""
+    """Return the damage with the cell's number of views."""
     return replace(STEPS[cell.damage], views=cell.limit)
 
 
@@ -141,13 +142,13 @@ Rows = Mapping[Cell, Values]
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the clauses say of a candidate on some cells."""
+    """Figures of the clauses for a candidate on some cells."""
 
     mean: float
     gain: float
-    """Over `none`, points."""
+    """Mean gain over `none`, in percentage points."""
     undamaged: float
-    """Loss, points; negative: a gain."""
+    """Mean loss without damage in percentage points; negative values are gains."""
     three_views: float
     worst: float
     """Largest loss of a cell."""
@@ -158,7 +159,7 @@ class Verdict:
     """Largest share of a column."""
     column_name: str
     broken: tuple[str, ...]
-    """Clauses that do not hold."""
+    """Clauses that are not met."""
 
     @property
     def eligible(self) -> bool:
@@ -167,27 +168,27 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Decision:
-    """What the rule says."""
+    """Result of the rule."""
 
     default: str
-    """The choice, or `none` in the place of one that was refuted."""
+    """The choice, or `none` if the choice was refuted."""
     choice: str
     verdicts: Mapping[str, Verdict]
-    """On the scenes of the choice."""
+    """Verdicts on the scenes of the choice, by candidate."""
     confirmation: Mapping[str, Mapping[str, Verdict]]
-    """On every room that confirms or refutes, of which there are cells."""
+    """Verdicts on each room that confirms or refutes and has cells."""
     confirmed: bool | None
-    """By all of them; None without any."""
+    """True if all rooms confirm the choice, or None without rooms."""
 
 
 def decide(rows: Rows, candidates: Sequence[str], limits: Limits = LIMITS) -> Decision:
-    """The default by the rule at the top of this file.
+    """Return the decision by the rule in the module docstring.
 
     Args:
-        rows: values of all candidates, `none` among them, in every cell.
-        candidates: their names, the simplest first.
+        rows: Values of all candidates, including `none`, in every cell.
+        candidates: Names of the candidates, the simplest first.
     Raises:
-        ValueError: no cell of the scenes of the choice, or no candidate `none`.
+        ValueError: If no cell is of a scene of the choice, or `none` is not a candidate.
     """
     chosen_on = {cell: values for cell, values in rows.items() if cell.scene in CHOICE}
     if len(chosen_on) == 0 or "none" not in candidates:
@@ -208,10 +209,10 @@ def decide(rows: Rows, candidates: Sequence[str], limits: Limits = LIMITS) -> De
 
 
 def verdict(rows: Rows, name: str, limits: Limits = LIMITS, *, spare: int = 0) -> Verdict:
-    """What the clauses say of one candidate.
+    """Return the verdict on one candidate.
 
     Args:
-        spare: cells by which a column may be beyond its limit.
+        spare: Number of cells by which a column may exceed its limit.
     """
     loss = {cell: mean(values["none"]) - mean(values[name]) for cell, values in rows.items()}
     worse = {cell: value > limits.worse for cell, value in loss.items()}
@@ -242,12 +243,12 @@ def verdict(rows: Rows, name: str, limits: Limits = LIMITS, *, spare: int = 0) -
 
 
 def mean(values: Iterable[float]) -> float:
-    """Of at least one value."""
+    """Return the mean of one or more values."""
     found = list(values)
     return sum(found) / len(found)
 
 
 def mean_where(values: Mapping[Cell, float], chosen: Callable[[Cell], bool]) -> float:
-    """Mean over some cells, 0 if there are none."""
+    """Return the mean over some cells, or 0 if there are none."""
     some = [value for cell, value in values.items() if chosen(cell)]
     return mean(some) if some else 0.0

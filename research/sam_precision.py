@@ -1,11 +1,11 @@
-"""What the precision of SAM's network costs, on masks that mean something.
+"""Effect of the precision of SAM's network on masks of objects.
 
-A small SAM (the mask decoder of full width) learns for some minutes to find the objects, parts and subparts of made
-pictures, whose masks are known. Pictures that it has not seen are then cut up in every precision. Each is compared with
-float32, and so is float32 on the same pictures with other noise in their pixels, which is what does not matter.
+A small SAM (with a mask decoder of full width) is trained for some minutes to find the objects, parts and subparts of
+synthetic images with known masks. New images are then segmented in each precision. The results are compared with
+float32. For scale, float32 is also compared with itself on the same images with other pixel noise.
 
     python -m research.sam_precision              two minutes of training on a GPU
-    python -m research.sam_precision --quick      a few steps of a smaller one, anywhere: it proves nothing
+    python -m research.sam_precision --quick      a few steps of a smaller network on any machine, without meaning
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from research.report import RESULTS, Report
 
 PRECISIONS: tuple[SamPrecision, ...] = ("float16", "bfloat16")
 NOISE = 6.0
-"""Standard deviation of the noise of pixels, of 255."""
+"""Standard deviation of the pixel noise, on a scale of 255."""
 CLASSES = 6
 
 
 @dataclass(frozen=True)
 class Size:
-    """How large everything is."""
+    """Sizes of networks, images and training."""
 
     side: int = 128
     width: int = 192
@@ -47,34 +47,37 @@ class Size:
     prompts: int = 16
     rate: float = 4e-4
     seconds: float = 120.0
-    """Of training."""
+    """Duration of the training."""
     steps: int | None = None
-    """Of training, in place of seconds: the same network on every machine."""
+    """Number of training steps in place of `seconds`, which gives the same network on every machine."""
     pictures: int = 12
     height: int = 96
-    """Of the pictures that are cut up; their width is `side`."""
+    """Height of the images to segment; their width is `side`."""
     points: int = 16
     seeds: int = 4
-    """Of noise."""
+    """Number of seeds of noise."""
 
 
 SMALL = Size(side=64, width=32, layers=2, batch=2, prompts=4, steps=5, pictures=2, height=48, points=5, seeds=2)
 
 
 class Pictures(NamedTuple):
-    """Made pictures without noise, and what is where."""
+    """Synthetic images without noise, with their ground truth."""
 
     colours: Tensor
-    """[B, H, W, 3], 0..255."""
+    """[B, H, W, 3] colors, in 0..255."""
     objects: Tensor
-    """[B, H, W], 0 for the background."""
+    """[B, H, W] object, or 0 for the background."""
     depth: Tensor
-    """[B, H, W]: 0, 1 in a part, 2 in a subpart of it."""
+    """[B, H, W]: 1 in a part, 2 in a subpart, 0 elsewhere."""
     classes: Tensor
-    """[B, H, W], 0..CLASSES; 0 for the background."""
+    """[B, H, W] class, in 1..CLASSES, or 0 for the background."""
 
     def truth(self, which: int, y: Tensor, x: Tensor) -> Tensor:
-        """[P, 3, H, W]: subpart, part and whole at points of a picture; what has no part is its own."""
+        """Return [P, 3, H, W] masks of the subpart, part and whole at points of an image.
+
+        At a point outside of parts, the mask of the part is that of the whole, and likewise for subparts.
+        """
         objects, depth = self.objects[which], self.depth[which]
         mine, deep = objects[y, x][:, None, None], depth[y, x][:, None, None]
         whole = objects == mine
@@ -83,7 +86,7 @@ class Pictures(NamedTuple):
 
 
 def make_pictures(count: int, height: int, width: int, g: torch.Generator, objects: int = 6) -> Pictures:
-    """Ellipses and boxes with a part and a subpart each, later ones on top."""
+    """Return images of ellipses and boxes with a part and a subpart each; later ones cover earlier ones."""
     device = g.device
     y, x = torch.meshgrid(torch.arange(height, device=device), torch.arange(width, device=device), indexing="ij")
 
@@ -115,13 +118,13 @@ def make_pictures(count: int, height: int, width: int, g: torch.Generator, objec
 
 
 def photographed(colours: Tensor, g: torch.Generator) -> Tensor:
-    """With noise, in 8 bits."""
+    """Return colors with noise in 8 bits."""
     noise = torch.randn(colours.shape, generator=g, device=colours.device)
     return (colours + NOISE * noise).round().clamp(0, 255).to(torch.uint8)
 
 
 def some_points(made: Pictures, count: int, g: torch.Generator) -> Tensor:
-    """[2, B, P], rows and columns; on objects as far as a few draws find them, but for one in eight."""
+    """Return [2, B, P], rows and columns of points. All but an eighth are on objects if a few draws find enough."""
     pictures, height, width = made.objects.shape
     drawn = [torch.randint(0, most, (pictures, 4 * count), generator=g, device=g.device) for most in (height, width)]
     where = torch.stack(drawn)
@@ -132,7 +135,7 @@ def some_points(made: Pictures, count: int, g: torch.Generator) -> Tensor:
 
 
 def small_sam(size: Size) -> Any:
-    """An untrained SAM whose mask decoder is that of the large ones."""
+    """Return an untrained SAM whose mask decoder is that of the large networks."""
     vision = transformers.SamVisionConfig(
         hidden_size=size.width,
         num_hidden_layers=size.layers,
@@ -155,7 +158,7 @@ def small_sam(size: Size) -> Any:
 
 
 def losses(logits: Tensor, ious: Tensor, truth: Tensor) -> Tensor:
-    """Of masks [B, P, 3, y, x] against shares of the pixels below each logit."""
+    """Return the loss of masks [B, P, 3, y, x] against the shares of pixels below each logit."""
     bce = binary_cross_entropy_with_logits(logits, truth)
     shown = logits.sigmoid()
     both = (shown * truth).sum(dim=(-2, -1))
@@ -166,7 +169,7 @@ def losses(logits: Tensor, ious: Tensor, truth: Tensor) -> Tensor:
 
 
 def train(model: Any, size: Size, device: str) -> list[float]:
-    """Trains for the time or the steps of the size; the losses."""
+    """Train for the time or the steps of the size, and return the losses."""
     g = torch.Generator(device).manual_seed(0)
     network = SamNetwork(model, device, "float32")
     model.train()
@@ -195,12 +198,12 @@ def train(model: Any, size: Size, device: str) -> list[float]:
 
 
 class Cut(NamedTuple):
-    """What a network makes of one picture."""
+    """Segmentation of one image by a network."""
 
     raw: Tensor
-    """[K, y, x], masks of all prompts on the whole picture."""
+    """[K, y, x], masks of all prompts on the whole image."""
     levels: dict[SamLevel, Tensor]
-    """What survives the rules."""
+    """Masks that pass the rules, by level."""
 
 
 def cut(model: Any, image: Tensor, precision: SamPrecision, size: Size, device: str) -> Cut:
@@ -220,14 +223,14 @@ def cut(model: Any, image: Tensor, precision: SamPrecision, size: Size, device: 
 
 
 def ious(some: Tensor, others: Tensor) -> Tensor:
-    """[M, N], of masks with masks."""
+    """Return [M, N], the IoU of each pair of masks."""
     a, b = some.flatten(1).double(), others.flatten(1).double()
     both = a @ b.T
     return both / (a.sum(dim=1)[:, None] + b.sum(dim=1) - both).clamp(min=1)
 
 
 def compare(found: Cut, exact: Cut, made: Pictures, which: int) -> dict[str, float]:
-    """Of one picture."""
+    """Return figures of the differences between two segmentations of one image."""
     both, either = (op(found.raw, exact.raw).flatten(1).sum(dim=1) for op in (torch.logical_and, torch.logical_or))
     changed, every = 0, 0
     for level in SAM_LEVELS:
@@ -251,7 +254,8 @@ def compare(found: Cut, exact: Cut, made: Pictures, which: int) -> dict[str, flo
 
 
 def label_miou(masks: Tensor, classes: Tensor) -> float:
-    """Of a label map whose every region takes the class of most of its pixels; unlabelled pixels are background."""
+    """Return the mIoU of a label map. Each region gets the class of most of its pixels, and unlabeled pixels are
+    background."""
     labels = stack_masks(masks)[0]
     shown = torch.zeros_like(classes)
     for i in labels.unique().tolist():
@@ -308,7 +312,7 @@ def main(quick: bool, output: Path, device: str, seconds: float | None) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a smaller network, a few steps")
-    parser.add_argument("--seconds", type=float, help="of training; 120 by default")
+    parser.add_argument("--seconds", type=float, help="seconds of training; 120 by default")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     arguments = parser.parse_args()

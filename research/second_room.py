@@ -1,8 +1,8 @@
-"""A second room: what is chosen on the tabletop and the plain room is confirmed or refuted here, and nowhere else.
+"""A second room, in which the choice made on the tabletop and the plain room is confirmed or refuted.
 
-A long bedroom beside `normlift_ns.demo`'s square room with a table in the middle: other objects, other sizes, other
-densities, a camera that walks through instead of round. It was written before anything was fitted on the grid, and no
-choice may look at it.
+It is a long bedroom, unlike the square room of `normlift_ns.demo` with a table in the middle. Objects, sizes and
+densities differ, and the camera moves along the room instead of around its center. It was written before anything was
+fitted on the grid, and must not be used to choose.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from research.made_room import Part, Plan, built, look
 from research.synthetic_scenes import World, world_of_room
 
 LENGTH, WIDTH, HEIGHT = 5.2, 3.4, 2.4
-"""Of the floor in x and y, and of the walls, metres. There is a ceiling lamp, but no ceiling."""
+"""Sides of the floor in x and y, and height of the walls, in meters. There is a ceiling lamp, but no ceiling."""
 SEED = 7
 FIELD_OF_VIEW = 68.0
-"""Horizontal, degrees."""
+"""Horizontal field of view in degrees."""
 
 
 def parts() -> list[Part]:
-    """All surfaces, one entry per class."""
+    """Return all surfaces, one entry per class."""
     bed = union(
         place(box(2.0, 1.4, 0.3, 0.04), 0, 0, 0.25),
         place(box(0.08, 1.4, 0.9, 0.03), -1.0, 0, 0.45),
@@ -78,9 +78,7 @@ PLAN = Plan(LENGTH, WIDTH, HEIGHT, tuple(parts()), SEED)
 
 
 def walk(count: int = 30, phase: float = 0.0, width: int = 320, height: int = 240) -> list[Camera]:
-    """Cameras on a figure of eight along the room, at heights between 0.9 and 1.7 m, that look across its middle at
-    the far side.
-    """
+    """Return cameras on a figure of eight along the room, at heights of 0.9 to 1.7 m, that face the opposite side."""
     found = []
     for i in range(count):
         t = 2 * math.pi * (i + phase) / count
@@ -91,6 +89,6 @@ def walk(count: int = 30, phase: float = 0.0, width: int = 320, height: int = 24
 
 
 def second(num_gaussians: int = 40_000, views: int = 30, width: int = 320) -> World:
-    """The room as a world: sixteen classes, 30 views, 5 held-out views between them."""
+    """Return the room as a world: sixteen classes, 30 views, 5 held-out views between them."""
     size = width, width * 3 // 4
     return world_of_room("second", built(PLAN, num_gaussians), walk(views, 0.0, *size), walk(5, 0.37, *size))

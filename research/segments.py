@@ -1,22 +1,23 @@
-"""Masks of texts as SAM 3 gives them, lifted from all views, against what one view alone tells.
+"""Masks of texts, like those of SAM 3, lifted from all views and compared with single views.
 
     python -m research.segments                       the tabletop; writes results/segments.json
-    python -m research.segments --scenes second third confirmation in made rooms; prints, and writes nothing
-    python -m research.segments --own                 prints a comparison in the views of the masks, too
+    python -m research.segments --scenes second third confirmation in synthetic rooms; prints, and writes nothing
+    python -m research.segments --own                 also prints a comparison in the views of the masks
 
-Fixed before it was first run: seeds 0 to 7. Of every object and view in which it appears, the exact mask is missing
-with one chance and that of another object of the view with another chance (20 % and 10 %, and as the other damages
-say); the seed draws which. A changed rule is chosen on seeds 0 to 3 and confirmed on 4 to 7 and in the made rooms.
+These settings were fixed before the first run. The seeds are 0 to 7. For each object and view that shows it, the exact
+mask is missing with one probability, and is that of another object of the view with another probability (20 % and 10 %,
+or those of other damages). The seed determines which. A changed rule is chosen on seeds 0 to 3 and confirmed on 4 to 7
+and in the synthetic rooms.
 
-What is reported, for every seed: IoU of what each rule selects, median and best of the single views, and how many
-objects exceed the median by 5 points, are no worse than the best, and do both. IoU is in pixels of all views together,
-where a Gaussian counts by the weight that it has in them: what is drawn of the selection, against the exact masks. A
-single view is its mask lifted alone, and answers for all views too; views with a missing or a wrong mask count, views
-without the object do not.
+For each seed, the report contains the IoU of the selection of each rule, and the median and best IoU of single views.
+It also contains the numbers of objects that exceed the median by 5 points, that are no worse than the best, and of
+both. The IoU is that of pixels of all views together, in which a Gaussian counts by its weight: the rendered selection
+against the exact masks. A single view is the lift of its mask alone, evaluated in all views. Views with a missing or a
+wrong mask count; views without the object do not.
 
-In its own picture alone a given mask is exact in seven views of ten by construction, and no answer exceeds that. With
---own this is printed as well, for seeds 0 to 7 of the first damage: mean over the views of an object of the IoU of the
-mask given there, and of the answer drawn there (pixels of which it makes more than half of the colour).
+In its own image, a given mask is exact in seven of ten views by construction, and no answer exceeds that. With --own,
+this comparison is also printed for seeds 0 to 7 of the first damage. It has means over the views of an object: the IoU
+of the mask of the view, and of the answer rendered in it (pixels of which it makes up more than half of the color).
 
 Keys: <scene>.m<missing>w<wrong>d<pixels of dilation>.seed<n>.<count, or object>.<rule, or median, best>.
 """
@@ -45,7 +46,7 @@ from tests.captures import SHARED, trained_scene, training_cameras, training_ind
 
 SEEDS = tuple(range(8))
 WIDER = 3
-"""Pixels by which dilated masks are."""
+"""Number of pixels by which masks are dilated."""
 
 
 @dataclass(frozen=True)
@@ -66,18 +67,18 @@ DAMAGES = (
 
 @dataclass(frozen=True)
 class Place:
-    """A scene with the evidence of its exact masks and of wider ones."""
+    """A scene with the evidence of its exact masks and of dilated ones."""
 
     name: str
     objects: tuple[str, ...]
     scene: GaussianScene
     cameras: list[Camera]
     maps: list[Tensor]
-    """[H, W] per view, number of the object or -1."""
+    """[H, W] object of every pixel per view, or -1 for none."""
 
     @cached_property
     def both(self) -> MaskEvidence:
-        """Exact masks, then dilated ones; rasterized once."""
+        """Evidence of exact masks and then dilated ones, rasterized once."""
         masks = []
         for labels in self.maps:
             exact = torch.stack([labels == i for i in range(len(self.objects))])
@@ -87,7 +88,7 @@ class Place:
 
     @cached_property
     def held(self) -> Tensor:
-        """[2Q, V, N] weight of every Gaussian in the masks of every view, exact ones and dilated ones."""
+        """[2Q, V, N] weight of every Gaussian in the masks of every view, for exact masks and then dilated ones."""
         evidence, inside = self.both.evidence, self.both.inside
         rows, count = evidence.rows, len(self.scene)
         column = rows.column.long()
@@ -108,13 +109,13 @@ class Place:
 
     @cached_property
     def appears(self) -> Tensor:
-        """[Q, V] whether a view shows an object."""
+        """[Q, V] True if a view shows an object."""
         return torch.stack([(m == i).any() for i in range(len(self.objects)) for m in self.maps]).view(
             -1, len(self.maps)
         )
 
     def damaged(self, damage: Damage, seed: int) -> Tensor:
-        """Whose mask each view has of each object: [Q, V], -1 for missing."""
+        """Return [Q, V], the object whose mask each view has for each object, or -1 for a missing mask."""
         g = torch.Generator().manual_seed(seed)
         whose = torch.full(self.appears.shape, -1)
         for view in range(len(self.maps)):
@@ -128,7 +129,7 @@ class Place:
         return whose
 
     def asked(self, whose: Tensor, dilated: bool) -> MaskEvidence:
-        """What the program is given."""
+        """Return the masks that the program receives."""
         count = len(self.objects)
         chosen = whose[:, self.both.evidence.region_view.long()]
         masks = self.both.inside[count:] if dilated else self.both.inside[:count]
@@ -140,7 +141,7 @@ def share(held: Tensor, total: Tensor) -> Tensor:
 
 
 def by_votes(held: Tensor, total: Tensor) -> Tensor:
-    """The rule in use, as `MaskEvidence.answer` has it (held against it by `check`)."""
+    """Select by the rule in use, as in `MaskEvidence.answer`; `check` compares both."""
     drawn = by_sum_where_found(held, total)
     found, both = held.sum(1) > 0, held[:, drawn].sum(1, dtype=torch.float64)
     either = held.sum(1, dtype=torch.float64) + (total - held)[:, drawn].sum(1, dtype=torch.float64)
@@ -150,18 +151,19 @@ def by_votes(held: Tensor, total: Tensor) -> Tensor:
 
 
 def by_sum(held: Tensor, total: Tensor) -> Tensor:
-    """More than half of a Gaussian's weight in all views is in the masks."""
+    """Select Gaussians with more than half of their weight over all views in the masks."""
     return share(*(part.sum(0, dtype=torch.float64) for part in (held, total))) > MIN_MASK_FRACTION
 
 
 def by_sum_where_found(held: Tensor, total: Tensor) -> Tensor:
-    """Likewise, views without a mask left out."""
+    """Select like `by_sum`, without the views that have no mask."""
     found = held.sum(1) > 0
     return by_sum(held[found], total[found])
 
 
 def by_majority(held: Tensor, total: Tensor) -> Tensor:
-    """Hard majority: more than half of the views that see a Gaussian have more than half of it in their mask."""
+    """Select Gaussians that have more than half of their weight in the mask in more than half of the views that show
+    them."""
     return 2 * (share(held, total) > MIN_MASK_FRACTION).sum(0) > (total > 0).sum(0)
 
 
@@ -174,18 +176,19 @@ RULES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 
 def ious(chosen: Tensor, truth: Tensor, total: Tensor, whole: float) -> np.ndarray:
-    """Of what selections [K, M] draw in all views.
+    """Return the IoU of the rendered selections [K, M] in all views.
 
     Args:
-        truth, total: weights [M] of the Gaussians in the masks of the object and in all.
-        whole: weight of all Gaussians in the masks of the object.
+        truth, total: Weights [M] of the Gaussians in the masks of the object, and in all pixels.
+        whole: Weight of all Gaussians in the masks of the object.
     """
     held, drawn = (chosen.float() @ torch.stack([truth, total], 1).float()).double().T
     return (held / (whole + drawn - held)).numpy()
 
 
 def check(place: Place, whose: Tensor, selected: Tensor) -> None:
-    """Makes sure that `by_votes` is the rule in use, but for a Gaussian in a thousand whose share is a half."""
+    """Check that `by_votes` agrees with the rule in use, except for one Gaussian in a thousand whose share is a
+    half."""
     found = place.asked(whose, dilated=False)
     for text, chosen in enumerate(selected):
         answer = found.answer(text).mask
@@ -193,7 +196,10 @@ def check(place: Place, whose: Tensor, selected: Tensor) -> None:
 
 
 def measure(place: Place, damage: Damage, seed: int) -> tuple[dict[str, np.ndarray], Tensor]:
-    """IoU of every object by every rule, median and best of single views; and what the rule in use selects [Q, N]."""
+    """Return the IoU of every object by every rule, with median and best of single views, and the selections [Q, N].
+
+    The selections are those of the rule in use.
+    """
     whose, count = place.damaged(damage, seed), len(place.objects)
     of_all, rows, selected = place.total.sum(0, dtype=torch.float64), {}, []
     views = torch.arange(len(place.maps))
@@ -217,7 +223,8 @@ def measure(place: Place, damage: Damage, seed: int) -> tuple[dict[str, np.ndarr
 
 
 def in_own_views(place: Place, selected: Sequence[Tensor]) -> list[tuple[float, float]]:
-    """For every seed, means over objects and views: IoU of the mask given there, and of the answer drawn there."""
+    """Return, for every seed, means over objects and views of the IoU of the mask of a view and of the answer rendered
+    in it."""
     given, drawn = torch.zeros(2, len(selected), len(place.objects), dtype=torch.float64)
     whose = [place.damaged(Damage(), seed) for seed in range(len(selected))]
     for view, (labels, camera) in enumerate(zip(place.maps, place.cameras)):
@@ -234,7 +241,7 @@ def in_own_views(place: Place, selected: Sequence[Tensor]) -> list[tuple[float, 
 
 
 def tabletop() -> Place:
-    """The capture, at its full size."""
+    """Return the capture at its full size."""
     folder = SHARED / "captures" / "tabletop"
     names = json.loads((folder / "labels.json").read_text())["labels"]
     values = {int(value): i for i, value in enumerate(names)}
@@ -245,7 +252,7 @@ def tabletop() -> Place:
 
 
 def of_world(world: World) -> Place:
-    """A made room; classes that no training view shows are left out."""
+    """Return a synthetic room without the classes that no training view shows."""
     shown = [i for i in range(world.classes) if bool((world.cells.maps == i).any())]
     lookup = torch.full((world.classes + 1,), -1, dtype=torch.int32)
     lookup[shown] = torch.arange(len(shown), dtype=torch.int32)
@@ -262,7 +269,7 @@ PLACES: dict[str, Callable[[], Place]] = {
 
 
 def add(report: Report, place: Place, damage: Damage, seed: int, rows: dict[str, np.ndarray]) -> None:
-    """Counts of every rule; of the first damage also every object."""
+    """Add the counts of every rule and, for the first damage, the figures of every object."""
     key, said = f"{place.name}.{damage.name}.seed{seed}", []
     for rule in RULES:
         above, as_good = rows[rule] >= rows["median"] + 0.05, rows[rule] >= rows["best"]

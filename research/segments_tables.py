@@ -1,4 +1,4 @@
-"""The tables of `research.segments`."""
+"""Tables of `research.segments`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def over_seeds(found: Document, start: str, end: str) -> list[float]:
 
 
 def segments(found: Document) -> str:
-    """Objects that pass both tests, in the worst and the best seed, and mean IoU."""
+    """Return a table of the objects that pass both tests, in the worst and the best seed, and the mean IoU."""
     rows = []
     for damage, title in MASK_DAMAGES.items():
         cells = [title]
@@ -29,7 +29,7 @@ def segments(found: Document) -> str:
 
 
 def segments_objects(found: Document) -> str:
-    """Every object in the worst of the seeds, and what single views tell, mean over seeds."""
+    """Return a table of every object in the worst seed, with figures of single views as means over seeds."""
     start, names = f"tabletop.{next(iter(MASK_DAMAGES))}", []
     for key in found.values:
         if key.startswith(f"{start}.seed0.") and key.endswith(".median"):

@@ -1,11 +1,11 @@
-"""What R knows: Gaussians without evidence, R against opacity, accuracy by number of views, and what mixing does.
+"""Relation of R to evidence, opacity and accuracy, accuracy by number of views, and the effect of mixed features.
 
-    python -m research.signals                  plain room and, where the captures are, the tabletop
+    python -m research.signals                  plain room and, if the captures are available, the tabletop
     python -m research.signals --scenes demo
 
-Writes results/signals.json. Drift: two features of different classes are mixed, a f + (1 - a) g; it drifts where the
-mixture is nearest to a text that is neither's. Features are text vectors with noise as in `damage`; length 0 is text
-only. No number is tuned to the paper's.
+The command writes results/signals.json. For drift, two features of different classes are mixed, a f + (1 - a) g. The
+mixture drifts if it is nearest to the text of a third class. Features are text vectors with noise as in `damage`; with
+noise 0, they are the texts. No number is tuned to those of the paper.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from research.variants import lifted_scores, refined_scores
 STEP = "hard"
 """Step of the ladder whose signals are shown."""
 MISTAKEN = ("shifted masks", "pose noise", STEP)
-"""Steps whose wrong answers are looked at."""
+"""Steps whose wrong answers are examined."""
 VIEWS = (2, 4, 8, 16, 32)
 NOISE = (0.0, 0.6, 1.2, 2.0, 3.0)
 MIXES = tuple(i / 10 for i in range(11))
 
 
 def evidence_table(world: World, words: Words, report: Report) -> None:
-    """`mistakes` on some steps of the ladder, and `signals` on one; means over seeds."""
+    """Add `mistakes` on some steps of the ladder and `signal_statistics` on one, as means over seeds."""
     neighbors = nearest_neighbors(world.scene.means, RefineConfig().k)
     for step in MISTAKEN:
         found = []
@@ -60,7 +60,10 @@ def evidence_table(world: World, words: Words, report: Report) -> None:
 
 
 def mistakes(reliability: Tensor, truth: Tensor, answer: Tensor) -> dict[str, float]:
-    """Where R is in its sixth to eighth tenth: share of wrong answers, and which of them name the largest class."""
+    """Return figures of the Gaussians with R in its sixth to eighth tenth.
+
+    They are the share of wrong answers, and the share of these that name the largest class.
+    """
     counts = (truth >= 0) & (reliability > 0)
     tenths = reliability[counts].argsort().tensor_split(10)
     some = torch.cat(tenths[5:8])
@@ -73,7 +76,7 @@ def mistakes(reliability: Tensor, truth: Tensor, answer: Tensor) -> dict[str, fl
 
 
 def views_curve(world: World, words: Words, report: Report) -> None:
-    """Accuracy by number of views, before and after the vote."""
+    """Add the accuracy by number of views, before and after the vote."""
     known = (world.truth >= 0).nonzero().squeeze(1)
     neighbors = nearest_neighbors(world.scene.means, RefineConfig().k)
     for count in [v for v in VIEWS if v < len(world.cameras)]:
@@ -92,7 +95,7 @@ def views_curve(world: World, words: Words, report: Report) -> None:
 
 
 def noisy(words: Words, noise: float, g: torch.Generator) -> Tensor:
-    """[K, D] one image feature of every class, as `damage` makes them; without noise: the texts themselves."""
+    """Return [K, D], one image feature of every class as in `damage`, or the texts themselves without noise."""
     if noise == 0:
         return words.classes
     classes, lengths = words.classes, Lengths()
@@ -105,7 +108,7 @@ def noisy(words: Words, noise: float, g: torch.Generator) -> Tensor:
 
 
 def drift_rate(words: Words, noise: float, mix: float, seed: int) -> float:
-    """Share of pairs of classes whose mixture is nearest to a third class."""
+    """Return the share of pairs of classes whose mixture is nearest to a third class."""
     features = noisy(words, noise, torch.Generator().manual_seed(seed))
     a, b = torch.triu_indices(len(features), len(features), 1)
     mixed = mix * features[a] + (1 - mix) * features[b]

@@ -1,6 +1,6 @@
-"""What mkdocs.yml asks of the documentation: pages from outside of docs/, an index, and examples in docstrings as code.
+"""Hooks of mkdocs.yml: pages from outside of docs/, an index, and examples in docstrings as code.
 
-README, CONTRIBUTING, SECURITY and CHANGELOG stay where people look for them, and are pages of the site as well.
+README, CONTRIBUTING, SECURITY and CHANGELOG stay at their usual places, and are also pages of the site.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[1]
 MATHJAX = "3.2.2"
-"""Version of MathJax, Apache-2.0, that the site contains."""
+"""Version of MathJax (Apache-2.0) in the site."""
 _LOG = logging.getLogger("mkdocs.hooks.normlift")
 OUTSIDE = {
     "README.md": "index.md",
@@ -35,14 +35,14 @@ _DOCTEST = re.compile(r"^(?P<block>(?:>>> .*)(?:\n(?!\s*\n|```).+)*)", re.MULTIL
 
 
 def on_config(config: Any) -> Any:
-    """Adds the version to the name in the header."""
+    """Add the version to the name in the header."""
     found = re.search(r'__version__ = "([^"]+)"', (ROOT / "normlift_ns" / "__init__.py").read_text("utf8"))
     config.site_name = f"{config.site_name} {found[1] if found else ''}".strip()
     return config
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Adds the pages from outside, and MathJax."""
+    """Add the pages from outside of docs/, the index and MathJax."""
     for name, page in OUTSIDE.items():
         files.append(File.generated(config, page, content=(ROOT / name).read_text("utf8")))
     files.append(File.generated(config, "index_of_options.md", content=index_of_options()))
@@ -53,7 +53,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def index_of_options() -> str:
-    """A page with a heading for every option and every message, which the search finds by its name."""
+    """Return a page with a heading for every option and every message, so that the search finds them by name."""
     pages = {name: (ROOT / "docs" / f"{name}.md").read_text("utf8") for name in ("options", "troubleshooting")}
     options, messages, command = dict[str, dict[str, list[str]]](), [], ""
     for line in pages["options"].splitlines():
@@ -75,13 +75,13 @@ def index_of_options() -> str:
 
 
 def _cells(line: str) -> tuple[str, list[str]]:
-    """The first cell of a row of a table, and the others; of another line, an empty one."""
+    """Return the first cell of a table row and its other cells; for other lines, the first cell is empty."""
     cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] if line.startswith("|") else [""]
     return cells[0], cells[1:]
 
 
 def mathjax() -> bytes | None:
-    """MathJax in one file, fetched by npm once; None if npm or its registry cannot be reached."""
+    """Return MathJax as one file, which npm fetches once, or None if npm or its registry is not available."""
     kept = ROOT / ".cache" / f"mathjax-{MATHJAX}.js"
     if not kept.is_file():
         sys.path.insert(0, str(ROOT / "web"))
@@ -102,7 +102,7 @@ def mathjax() -> bytes | None:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Links as they are right on the site; bars in code without the backslash that tables on GitHub need."""
+    """Adapt links to the site, and remove the backslashes before bars in code, which tables on GitHub need."""
     outside = page.file.src_uri in OUTSIDE.values()
     markdown = re.sub(r"`[^`\n]+`", lambda found: found[0].replace(r"\|", "|"), markdown)
     markdown = markdown.replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")
@@ -110,12 +110,16 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Flags that stay in one line."""
+    """Mark flags, which must not be broken over lines."""
     return re.sub(r"<code>(--[a-z][\w-]*(?: [^<\s]{1,12})?)</code>", r'<code class="flag">\1</code>', html)
 
 
 def _moved(target: str, outside: bool) -> str:
-    """Where a link leads on the site, from a page of docs/ or from one outside of it."""
+    """Return the target of a link on the site.
+
+    Args:
+        outside: True for links on pages from outside of docs/.
+    """
     name = target.removeprefix("../") if target.startswith("../") else target if outside else ""
     if name in OUTSIDE:
         return OUTSIDE[name]
@@ -127,10 +131,10 @@ def _moved(target: str, outside: bool) -> str:
 
 
 class Doctests(griffe.Extension):
-    """Examples after >>> in docstrings become blocks of code."""
+    """Extension that turns examples after >>> in docstrings into blocks of code."""
 
     def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Rewrites the docstring of one object."""
+        """Rewrite the docstring of one object."""
         if obj.docstring is not None:
             text = re.sub(r"<(\w+)>", r"&lt;\1&gt;", obj.docstring.value)
             text = re.sub(r"(?<!\n)\n(Args|Returns|Raises):$", r"\n\n\1:", text, flags=re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Answers after the attributes of a capture take the precision of SPZ, one at a time.
+"""Agreement of answers after single attributes of a capture are rounded to the precision of SPZ.
 
 python -m research.spz_attributes tabletop
 """
@@ -28,7 +28,7 @@ FOLDER = Path("outputs/spz_attributes")
 
 
 def selected(splat: SplatParameters, name: str, options: nl.SplatOptions) -> Tensor:
-    """Which Gaussians the prompts select after a lift; GLB files are exact."""
+    """Return the Gaussians that the prompts select after a lift; GLB files are exact."""
     path = FOLDER / "splat.glb"
     path.write_bytes(encode_glb(splat, {}, {}))
     scene = nl.open_splat(path, options)
@@ -40,7 +40,7 @@ def selected(splat: SplatParameters, name: str, options: nl.SplatOptions) -> Ten
 
 
 def main(name: str) -> None:
-    """Prints the intersection over union of each prompt, with the attributes that are rounded."""
+    """Print the intersection over union of each prompt, with the attributes that are rounded."""
     config = SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml"
     trained = TrainedSplat.of(nl.open_scene(config))
     rows = exportable_rows(trained.columns(), torch.ones(len(trained.parameters["means"]), dtype=torch.bool))

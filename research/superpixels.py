@@ -1,24 +1,25 @@
-"""Superpixels of this package beside scikit-image's SLIC: quality against exact masks, a color lift, and time.
+"""Superpixels of this package compared with scikit-image's SLIC: quality against exact masks, a color lift, and time.
 
     python -m research.superpixels            the tabletop; results/superpixels.json
     python -m research.superpixels --quick    without the two lifts; prints, and writes nothing
 
-Quality is measured on all images of the tabletop, with the masks of its 12 things and the background. For a fair
-comparison, ours are asked for as many superpixels as scikit-image returns on average when it is asked for 128, 256 and
-512, and the numbers that both return are reported. Boundary recall is the share of boundary pixels of the masks with a
-boundary pixel of superpixels at a distance of at most 2 rows and 2 columns. The undersegmentation error is that of
-Neubert and Protzel (2012): for every thing and superpixel that share pixels, the smaller of the parts inside and
-outside, divided by the number of pixels. Both are means over images, in points.
+Quality is measured on all images of the tabletop, with the masks of its 12 objects and the background. scikit-image is
+asked for 128, 256 and 512 superpixels. For a fair comparison, this package is asked for as many as scikit-image returns
+on average, and the returned numbers of both are reported. Boundary recall is the share of boundary pixels of the masks
+with a boundary pixel of superpixels within 2 rows and 2 columns. The undersegmentation error is that of Neubert and
+Protzel (2012). For every object and superpixel that share pixels, it adds the smaller of the parts inside and outside,
+and the sum is divided by the number of pixels. Both are means over images, in percentage points.
 
-The lifts take colors in 256 superpixels, with default options. Each is asked the prototypes of the 12 things, as in
-`research.cut`: mean over things of average precision and of the IoU at the best threshold, in points, in six images.
+The lifts use colors in 256 superpixels, with default options. Each is queried for the prototypes of the 12 objects, as
+in `research.cut`. The figures are means over objects of average precision and of the IoU at the best threshold, in
+percentage points, in six images.
 
-Rule, written before ours were first run: ours replace scikit-image's on a GPU if all five figures are at most 0.5
-points worse: boundary recall and undersegmentation error at 256, their means over the three numbers, average precision,
-and best IoU. They replace scikit-image's on CPUs as well if, besides, they take less CPU time per image of the fox.
+This rule was written before the first run. On a GPU, this package's superpixels replace scikit-image's if five figures
+are at most 0.5 points worse. These are boundary recall and undersegmentation error at 256, their means over the three
+numbers, average precision, and best IoU. On CPUs, they must also take less CPU time per image of the fox.
 
-What came of it: all five figures are better, boundary recall by 3 to 6 points, average precision by 7, best IoU by 5.
-On 2 cores, ours take 0.11 s of CPU per image, scikit-image 0.56 s. They replace it everywhere.
+Result: all figures are better: boundary recall by 3 to 6 points, average precision by 7, best IoU by 5. On 2 cores,
+this package takes 0.11 s of CPU per image and scikit-image 0.56 s. Its superpixels replace scikit-image's everywhere.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ CONFIG = CAPTURES / "outputs" / "tabletop" / "splatfacto" / "run" / "config.yml"
 
 
 def by_scikit_image(image: Tensor, count: int) -> np.ndarray:
-    """Return the labels that this package took before, without gaps."""
+    """Return scikit-image's labels, which earlier versions of this package used, without gaps."""
     labels = slic(image.numpy(), n_segments=count, compactness=10.0, start_label=0)
     return np.unique(labels, return_inverse=True)[1].reshape(labels.shape)
 
@@ -74,7 +75,7 @@ def boundary_recall(labels: np.ndarray, truth: np.ndarray) -> float:
 
 
 def undersegmentation_error(labels: np.ndarray, truth: np.ndarray) -> float:
-    """Return the pixels that superpixels share with things that they leave, over all pixels.
+    """Return the undersegmentation error of Neubert and Protzel; see the module docstring.
 
     >>> undersegmentation_error(np.array([[0, 0, 0, 0, 1, 1]]), np.array([[0, 0, 0, 1, 1, 1]]))  # 1 of 4, twice, of 6
     0.3333333333333333

@@ -31,7 +31,7 @@ CHANNELS, ROUNDS = 128, 7
 
 
 class StockView:
-    """One view by gsplat's own projection, lists and kernel."""
+    """One view with gsplat's own projection, lists and kernel."""
 
     def __init__(self, scene: GaussianScene, camera: Camera, settings: RasterSettings) -> None:
         from gsplat.cuda._wrapper import fully_fused_projection_2dgs, isect_offset_encode, isect_tiles  # noqa: PLC0415
@@ -49,7 +49,7 @@ class StockView:
         self.opacities = scene.opacities[None].contiguous()
 
     def composite(self, colors: Tensor) -> tuple[Tensor, Tensor]:
-        """Image [H, W, C] and alpha [H, W] of colors [N, C]."""
+        """Return the image [H, W, C] and alpha [H, W] of colors [N, C]."""
         from gsplat.cuda._wrapper import rasterize_to_pixels_2dgs  # noqa: PLC0415
 
         image, alpha, *_ = rasterize_to_pixels_2dgs(
@@ -60,14 +60,14 @@ class StockView:
 
 
 def one_hot(rows: Tensor, n: int) -> Tensor:
-    """Colors [N, CHANNELS] that give every row a channel of its own."""
+    """Return colors [N, CHANNELS] that give every row a separate channel."""
     colors = torch.zeros(n, CHANNELS, device="cuda")
     colors[rows, torch.arange(len(rows), device="cuda")] = 1
     return colors
 
 
 def weight_errors(scene: GaussianScene, camera: Camera, settings: RasterSettings) -> dict[str, float]:
-    """Differences of the weights of every Gaussian in every pixel, and in every region of 60 x 60 pixels.
+    """Return differences of the weights of every Gaussian in every pixel, and in every region of 60 x 60 pixels.
 
     They are the largest absolute difference (pixel, region), the relative Frobenius norm (pixel_rel, region_rel) and
     the number of pairs of a Gaussian and a pixel that differ by more than 1e-5 (differing).
@@ -103,7 +103,7 @@ def weight_errors(scene: GaussianScene, camera: Camera, settings: RasterSettings
 
 
 def region_sums(image: Tensor) -> Tensor:
-    """Sums [R, C] in float64 of an image [H, W, C] over the regions of `grid_labels`."""
+    """Return float64 sums [R, C] of an image [H, W, C] over the regions of `grid_labels`."""
     height, width, channels = image.shape
     padded = torch.nn.functional.pad(image, (0, 0, 0, -width % CELL, 0, -height % CELL))
     cells = padded.view(padded.shape[0] // CELL, CELL, padded.shape[1] // CELL, CELL, channels)
@@ -111,11 +111,12 @@ def region_sums(image: Tensor) -> Tensor:
 
 
 def norm_of_errors(scene: GaussianScene, camera: Camera, settings: RasterSettings) -> float:
-    """The largest norm over the Gaussians of the differences of their weights in a pixel.
+    """Return an upper estimate of the largest norm, over pixels, of the differences of the weights of all Gaussians.
 
-    No single difference is larger. The norm is estimated by random combinations: if every Gaussian has a random sign as
-    its color, the squared difference of two renders is on average the squared norm. The estimate from 128 combinations
-    is at least two thirds of the norm in all but one of 10^7 pixels, so three halves of it are returned.
+    No single difference exceeds it. The norm is estimated by random combinations: if every Gaussian has a random sign
+    as its color, the squared difference of two renders is on average the squared norm. The estimate from 128
+    combinations is at least two thirds of the norm in all but one of 10^7 pixels, so the function returns 1.5 times the
+    estimate.
     """
     signs = torch.randint(0, 2, (len(scene), CHANNELS), device="cuda").mul(2).sub(1).float()
     theirs, _ = StockView(scene, camera, settings).composite(signs)
@@ -124,7 +125,7 @@ def norm_of_errors(scene: GaussianScene, camera: Camera, settings: RasterSetting
 
 
 def stock_renders(case: Case, settings: RasterSettings) -> dict[str, Callable[[], None]]:
-    """The RGB render of all views by gsplat: its function, and its kernels alone."""
+    """Return functions for the RGB render of all views by gsplat, and for its kernels alone."""
     from gsplat import rasterization_2dgs  # noqa: PLC0415
 
     scene, colors = case.scene, torch.rand(len(case.scene), 3, device="cuda")
@@ -147,7 +148,7 @@ def stock_renders(case: Case, settings: RasterSettings) -> dict[str, Callable[[]
 
 
 def measure(report: Report, name: str, folder: Path) -> None:
-    """Adds the metrics NAME.* of a trained scene."""
+    """Add the metrics NAME.* of a trained scene."""
     checkpoint = next((folder / name / "ckpts").glob("*.pt"))
     opened = open_splat(checkpoint, splat_options(name), say=print)
     scene, settings = opened.gaussians.to("cuda"), RasterSettings.recorded(opened.identity)

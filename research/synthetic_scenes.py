@@ -1,7 +1,7 @@
-"""Scenes whose every Gaussian has a known class, with evidence on cells fine enough for any damage to the masks.
+"""Scenes with known classes of their Gaussians, and evidence on cells that are fine enough for any damage to the masks.
 
 Evidence is rasterized once, on the joint cells of the exact masks and of `BLOCKS` square blocks across every image.
-Whatever damage does to masks is then a new grouping of cells (`Evidence.regroup`), and no damage rasterizes again.
+Damage to masks then only regroups the cells (`Evidence.regroup`), without another rasterization.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from tests.captures import SHARED, all_cameras, base_colors, trained_scene, trai
 from tests.plain_room import plain_room
 
 BLOCKS = 40
-"""Blocks across an image."""
+"""Number of blocks across an image."""
 PIXEL_STEP = 4
-"""Every so many pixels of held-out views, across and down, one is looked at."""
+"""Distance between sampled pixels of held-out views along each axis, in pixels."""
 SHADE = 0.3
-"""Optical depth of all floaters together in the median view: they take a quarter of its light."""
+"""Optical depth of all floaters together in the median view, in which they absorb a quarter of the light."""
 PARTS = 4
-"""Of every object, where regions are of parts."""
+"""Number of parts of every object, if regions are of parts."""
 PURITY, WEIGHT = 0.75, 1.0
-"""A Gaussian has the class that holds this share of its weight in the exact masks of all training views, background
-included, if that weight is at least this many pixels; otherwise it does not count."""
+"""Smallest share of the weight of a Gaussian in the exact masks of its class, and smallest weight in pixels, over all
+training views and including the background. A Gaussian below either minimum does not count."""
 
 
 @dataclass(frozen=True)
@@ -45,39 +45,39 @@ class Cells:
     """Cells of all training views, the columns of their evidence."""
 
     view: Tensor
-    """[C]"""
+    """[C] view of each cell."""
     mask: Tensor
-    """[C] class of the exact mask, -1 for none."""
+    """[C] class of the exact mask, or -1 for none."""
     centre: Tensor
-    """[C, 2] (x, y), pixels."""
+    """[C, 2] center (x, y), in pixels."""
     maps: Tensor
-    """[V, H, W] exact masks, to look other places up in."""
+    """[V, H, W] exact masks, for other positions."""
     of_pixel: Tensor
     """[V, H, W] cell of every pixel."""
 
 
 @dataclass(frozen=True)
 class World:
-    """A scene with its evidence and its truth."""
+    """A scene with its evidence and its ground truth."""
 
     name: str
     scene: GaussianScene
     cameras: list[Camera]
     evidence: Evidence
-    """On cells."""
+    """Evidence of the cells."""
     cells: Cells
     truth: Tensor
-    """[N] class of every Gaussian, -1 where it does not count."""
+    """[N] class of every Gaussian, or -1 if it does not count."""
     classes: int
     held_out: list[Camera]
     held_out_maps: Tensor
     """[V', H, W] exact masks."""
     colors: Tensor | None = None
-    """[N, 3] sRGB in 0..1, of the picture that a region's look is taken from."""
+    """[N, 3] sRGB colors in 0..1, for the histograms of regions."""
 
     @cached_property
     def squared(self) -> Evidence:
-        """Evidence of A ** 2, as SFS weighs."""
+        """Evidence with the weights A ** 2 of Splat Feature Solver."""
         return cell_evidence(self.scene, self.cameras, self.cells.maps, weight_power=2)[0]
 
     @cached_property
@@ -93,7 +93,7 @@ class World:
 
     @cached_property
     def azimuth_rank(self) -> Tensor:
-        """[V, K] place of every training camera in the order of their azimuths around each object, z up."""
+        """[V, K] rank of every training camera by its azimuth around each object, with z up."""
         eyes = torch.stack([camera.world_to_camera.double().cpu().inverse()[:3, 3] for camera in self.cameras])
         means, truth, ranks = self.scene.means.double().cpu(), self.truth.cpu(), []
         for c in range(self.classes):
@@ -105,7 +105,7 @@ class World:
 
     @cached_property
     def angles(self) -> Tensor:
-        """[K, V, V] degrees between the directions from the middle of each object to the training cameras."""
+        """[K, V, V] angles in degrees between the directions from the center of each object to the training cameras."""
         eyes = torch.stack([camera.world_to_camera.double().cpu().inverse()[:3, 3] for camera in self.cameras])
         means, truth, found = self.scene.means.double().cpu(), self.truth.cpu(), []
         for c in range(self.classes):
@@ -116,7 +116,7 @@ class World:
 
     @cached_property
     def parts(self) -> Tensor:
-        """[C] part of an object that most of a cell shows, see `Cells` and `parts_of`."""
+        """[C] part of an object with the most weight in each cell; see `parts_of`."""
         part = parts_of(self.scene.means.cpu(), self.truth.cpu(), self.classes)
         rows = self.evidence.rows.to("cpu")
         weights = torch.zeros(len(self.cells.view), PARTS)
@@ -124,20 +124,20 @@ class World:
         return weights.argmax(1)
 
     def to(self, device: str) -> World:
-        """Tensors of the lift on another device."""
+        """Return the world with the tensors of the lift on another device."""
         scene, evidence, truth = (x.to(device) for x in (self.scene, self.evidence, self.truth))
         return replace(self, scene=scene, evidence=evidence, truth=truth)
 
 
 def block_side(maps: Tensor) -> int:
-    """Side of the blocks of maps [V, H, W], pixels."""
+    """Return the side of the blocks of maps [V, H, W], in pixels."""
     return -(-maps.shape[2] // BLOCKS)
 
 
 def cell_evidence(
     scene: GaussianScene, cameras: Sequence[Camera], maps: Tensor, *, weight_power: int = 1
 ) -> tuple[Evidence, Cells]:
-    """Evidence on the joint cells of masks [V, H, W] and blocks."""
+    """Return the evidence on the joint cells of masks [V, H, W] and blocks, and the cells."""
     views, height, width = maps.shape
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     side = block_side(maps)
@@ -162,7 +162,8 @@ def cell_evidence(
 
 
 def parts_of(means: Tensor, thing: Tensor, count: int) -> Tensor:
-    """[N] part of every Gaussian of a thing, 0 where it is of none: the nearest of points far from each other."""
+    """Return [N], the part of every Gaussian of an object: the nearest of distant points. Other Gaussians have part
+    0."""
     part = torch.zeros(len(means), dtype=torch.int64)
     for k in range(count):
         of_thing = (thing == k).nonzero().squeeze(1)
@@ -180,7 +181,7 @@ def parts_of(means: Tensor, thing: Tensor, count: int) -> Tensor:
 
 
 def truth_of(evidence: Evidence, cells: Cells, classes: int) -> Tensor:
-    """Class of every Gaussian by the exact masks, see `PURITY` and `WEIGHT`."""
+    """Return the class of every Gaussian by the exact masks; see `PURITY`."""
     one_hot = torch.nn.functional.one_hot(cells.mask + 1, classes + 1).to(evidence.rows.weight)
     weights = evidence.rows.matmul(one_hot)
     total = weights.sum(1)
@@ -189,7 +190,7 @@ def truth_of(evidence: Evidence, cells: Cells, classes: int) -> Tensor:
 
 
 def tabletop(views: int | None = None) -> World:
-    """The tabletop capture: twelve objects, 44 training views or the first so many of an even spread of them."""
+    """Return the tabletop capture: twelve objects, and 44 training views or `views` of them, evenly spread."""
     scene, cameras = trained_scene("tabletop"), all_cameras("tabletop")
     folder = SHARED / "captures" / "tabletop" / "instance"
     maps = torch.stack([
@@ -208,13 +209,14 @@ def tabletop(views: int | None = None) -> World:
 
 
 def demo(num_gaussians: int = 40_000, views: int = 24, width: int = 320) -> World:
-    """The plain room: thirteen classes, known of every Gaussian but floaters, whether any view sees it or not."""
+    """Return the plain room: thirteen classes, known for every Gaussian except floaters, whether a view shows it or
+    not."""
     size = width, width * 3 // 4
     return world_of_room("demo", plain_room(num_gaussians), demo_cameras(views, *size), held_out_cameras(4, *size))
 
 
 def world_of_room(name: str, room: DemoRoom, cameras: list[Camera], held_out: list[Camera]) -> World:
-    """A room of known classes, seen from two sets of cameras."""
+    """Return a room of known classes, seen from two sets of cameras."""
     drawn = room
     if torch.cuda.is_available():
         drawn = replace(room, scene=room.scene.to("cuda"), labels=room.labels.to("cuda"))
@@ -227,7 +229,7 @@ def world_of_room(name: str, room: DemoRoom, cameras: list[Camera], held_out: li
 
 
 def with_floaters(world: World, share: float = 0.05, seed: int = 0) -> World:
-    """The world with so many more Gaussians, half-transparent blobs between cameras and what they see; classless."""
+    """Return the world with more Gaussians, half-transparent blobs without a class between cameras and surfaces."""
     scene, count, g = world.scene, round(share * len(world.scene)), torch.Generator().manual_seed(seed)
     eyes = torch.stack([camera.world_to_camera.double().inverse()[:3, 3] for camera in world.cameras]).float()
     eye = eyes[torch.randint(0, len(eyes), (count,), generator=g)]
@@ -248,7 +250,7 @@ def with_floaters(world: World, share: float = 0.05, seed: int = 0) -> World:
 
 
 def _optical_depth(means: Tensor, opacities: Tensor, camera: Camera) -> Tensor:
-    """Mean over the pixels of one view of what blobs of scale 1 add up to."""
+    """Return the mean optical depth of blobs of scale 1 over the pixels of one view."""
     pose, K = camera.world_to_camera.float(), camera.K.float()
     place = means @ pose[:3, :3].T + pose[:3, 3]
     pixel = place @ K.T
@@ -263,13 +265,13 @@ class Words:
     """Vectors of texts."""
 
     classes: Tensor
-    """[K, D] unit, those of the world's classes."""
+    """[K, D] unit vectors of the world's classes."""
     others: Tensor
-    """[M, D] unit, of many texts; noise follows their covariance."""
+    """[M, D] unit vectors of many texts, whose covariance the noise follows."""
 
 
 def real_words() -> Words:
-    """CLIP ViT-B/32 vectors of the tabletop's stand-in names, and of the 1,203 LVIS names."""
+    """Return CLIP ViT-B/32 vectors of the tabletop's stand-in names, and of the 1,203 LVIS names."""
     folder = SHARED / "clip_vectors"
     vectors = normalize(torch.from_numpy(np.load(folder / "lvis_v1_text.npy")).double(), dim=1).float()
     index = {name: i for i, name in enumerate(json.loads((folder / "lvis_v1_names.json").read_text()))}
@@ -278,7 +280,8 @@ def real_words() -> Words:
 
 
 def made_words(classes: int, dimension: int = 512, seed: int = 0) -> Words:
-    """Vectors as close to each other as those of CLIP's texts (mean cosine 0.74), in a space of 100 directions."""
+    """Return vectors as similar to each other as those of CLIP's texts (mean cosine 0.74), in a space of 100
+    directions."""
     g = torch.Generator().manual_seed(seed)
     common = normalize(torch.randn(dimension, generator=g), dim=0)
     space = torch.linalg.qr(torch.randn(dimension, 100, generator=g)).Q.T

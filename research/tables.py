@@ -1,4 +1,4 @@
-"""The tables of the pages that `research.pages` refreshes, from the results files."""
+"""Tables of the pages that `research.pages` updates, from the results files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ FLAGS = {
 
 
 def tables(found: Documents) -> dict[str, str]:
-    """Every table by its name in the markers of the pages; `origin-…` is the line that says what measured a file."""
+    """Return every table by its name in the markers of the pages; `origin-…` is the line with the command and the
+    machine."""
     accuracy, fit, signals, h100 = (found[name] for name in ("accuracy", "fit", "signals", "h100"))
     return {
         **{f"origin-{name}": f"`{one.command}` on {one.hardware}.\n" for name, one in found.items()},
@@ -66,7 +67,7 @@ def tables(found: Documents) -> dict[str, str]:
 
 
 def published(name: str) -> str:
-    """One table of the paper, with an empty column for the reader's own numbers."""
+    """Return one table of the paper, with an empty column for the reader's own numbers."""
     rows = with_own_column(TABLES[name], {})
     shown = [
         [
@@ -79,7 +80,7 @@ def published(name: str) -> str:
 
 
 def ablation(accuracy: Document, label: str, prefix: str, group: str = "ablation", *, others: bool = True) -> str:
-    """Means over steps of damage, and beside them the worst observation and what is copied."""
+    """Return means over steps of damage, with the worst observation and the share that is copied."""
     v, rows = accuracy.values, []
     for name, title in TITLES.items():
         key = f"{prefix}{group}.{name}"
@@ -98,7 +99,7 @@ def ablation(accuracy: Document, label: str, prefix: str, group: str = "ablation
 
 
 def damage(accuracy: Document, scene: str) -> str:
-    """mIoU of every variant on every step."""
+    """Return the mIoU of every variant on every step."""
     start = f"{PREFIXES[scene]}ladder"
     names = [name for name in TITLES if f"{start}.{steps(accuracy)[0]}.{name}.miou" in accuracy.values]
     rows = [(step, *(accuracy.interval(f"{start}.{step}.{name}.miou") for name in names)) for step in steps(accuracy)]
@@ -106,7 +107,7 @@ def damage(accuracy: Document, scene: str) -> str:
 
 
 def reliability(accuracy: Document, scene: str) -> str:
-    """How well R and the norm rank accuracy."""
+    """Return the rank correlations of R and of the norm with accuracy."""
     v, prefix, rows = accuracy.values, PREFIXES[scene], []
     for step in (step for step in steps(accuracy) if f"{prefix}reliability.{step}.lowest_bin" in v):
         low, high = (v[f"{prefix}reliability.{step}.{end}_bin"] for end in ("lowest", "highest"))
@@ -116,7 +117,7 @@ def reliability(accuracy: Document, scene: str) -> str:
 
 
 def evidence(signals: Document) -> str:
-    """Gaussians with and without evidence."""
+    """Return figures of Gaussians with and without evidence."""
     s, rows = signals.values, []
     for scene in PREFIXES:
         for group, label in (("all", "all"), ("zero", "R = 0"), ("seen", "R > 0")):
@@ -128,7 +129,7 @@ def evidence(signals: Document) -> str:
 
 
 def opacity(signals: Document) -> str:
-    """R against opacity."""
+    """Return the comparison of R with opacity."""
     s, rows = signals.values, []
     for scene in PREFIXES:
         key = f"{scene}.{STEP}.opacity"
@@ -139,7 +140,7 @@ def opacity(signals: Document) -> str:
 
 
 def views(signals: Document) -> str:
-    """mIoU by number of views, before and after the vote."""
+    """Return the mIoU by number of views, before and after the vote."""
     counts = [k.split(".")[:3:2] for k in signals.values if ".views." in k and k.endswith(".paper.miou")]
     rows = [
         (f"{scene}, {n}", *(signals.interval(f"{scene}.views.{n}.{x}.miou") for x in ("none", "paper")))
@@ -149,7 +150,7 @@ def views(signals: Document) -> str:
 
 
 def mixtures(signals: Document) -> str:
-    """Share of pairs of classes whose equal mixture is nearest to a third."""
+    """Return the share of pairs of classes whose equal mixture is nearest to a third class."""
     s = signals.values
     keys = [k for k in s if k.startswith("tabletop.drift.") and k.endswith("mix0.5")]
     noise = [k.split("noise")[1].split(".mix")[0] for k in keys]
@@ -158,7 +159,7 @@ def mixtures(signals: Document) -> str:
 
 
 def parameters(fit: Document) -> str:
-    """What was fitted."""
+    """Return the fitted parameters."""
     names = ("k", "sigma_d", "tau", "gamma", "delta")
     groups = (("fitted, for `--vote paper`", "fitted"), ("fitted for plain voting", "fitted_knn"))
     rows = [(label, *(f"{fit.values[f'{group}.{x}']:g}" for x in names)) for label, group in groups]
@@ -166,7 +167,7 @@ def parameters(fit: Document) -> str:
 
 
 def held_out(fit: Document) -> str:
-    """What the fit is worth on other damage."""
+    """Return the gain of the fit on other damage."""
     rows = [
         (label, *(fit.interval(f"{scene}held_out.{key}", 2) for scene in ("", "tabletop.", "demo.")))
         for key, label in (
@@ -182,7 +183,7 @@ def held_out(fit: Document) -> str:
 
 
 def presets(document: Document, accuracy: Document, losses: Document) -> str:
-    """Time, memory and error of the whole lift, and what it does to mIoU where that was measured."""
+    """Return time, memory and error of the whole lift, and its effect on mIoU if that was measured."""
     v, rows = document.values, []
     for name, label in PRESETS.items():
         seconds, memory = f"{v[f'{name}.s']:.3g} s", f"{v[f'{name}.peak_gib']:.2f} GiB"
@@ -195,7 +196,7 @@ def presets(document: Document, accuracy: Document, losses: Document) -> str:
 
 
 def stages(h100: Document) -> str:
-    """Seconds of the stages of a lift on a GPU with their errors against float64, one column per scene."""
+    """Return the seconds of the stages of a lift on a GPU with their errors against float64, one column per scene."""
     v, error = h100.values, {metric.key: metric.error for metric in h100.metrics}
     scenes = [key.removesuffix(".total_s") for key in v if key.endswith(".total_s")]
 
@@ -227,7 +228,7 @@ def stages(h100: Document) -> str:
 
 
 def growth(h100: Document) -> str:
-    """Time for evidence as one quantity grows."""
+    """Return the time for evidence as one quantity grows."""
     found = [m for m in h100.metrics if m.key.startswith("growth.")]
     names = [m.key.split(".", 1)[1].removesuffix(".evidence_s").rsplit("_", 1) for m in found]
     rows = []
@@ -239,7 +240,7 @@ def growth(h100: Document) -> str:
 
 
 def plans(document: Document) -> str:
-    """What a plan told of whole lifts, and what they took."""
+    """Return the estimates of plans for whole lifts, and the measured times."""
     v, rows = document.values, []
     for case in (key.removesuffix(".ratio") for key in v if key.endswith(".ratio")):
         capture, front_end, state = case.split(".")
@@ -253,7 +254,7 @@ def plans(document: Document) -> str:
 
 
 def overhead(document: Document) -> str:
-    """Whole commands, in turns with those of another version."""
+    """Return the times of whole commands, measured in turns with those of another version."""
     v, rows = document.values, []
     for what in ("lift", "query"):
         for kind in ("wall", "cpu"):
@@ -264,7 +265,7 @@ def overhead(document: Document) -> str:
 
 
 def worlds(document: Document) -> str:
-    """Margins of right and wrong worlds, and what the search found."""
+    """Return the margins of right and wrong worlds, and the results of the search."""
     v, rows = document.values, []
     for name in (key.removesuffix(".right.margin") for key in v if key.endswith(".right.margin")):
         found = [value for key, value in v.items() if key.startswith(f"{name}.") and key.endswith(".found")]
@@ -278,7 +279,7 @@ def worlds(document: Document) -> str:
 
 
 def focal(document: Document) -> str:
-    """PSNR and margin with wrong focal lengths."""
+    """Return PSNR and margin with wrong focal lengths."""
     v, rows = document.values, []
     for name in (key.removesuffix(".right.margin") for key in v if key.endswith(".right.margin")):
         keys = [f"{name}.focal{factor}" for factor in FACTORS]
@@ -287,7 +288,7 @@ def focal(document: Document) -> str:
 
 
 def every_metric(document: Document, having: str = "") -> str:
-    """The metrics of one file, of those whose key has some part, as they stand."""
+    """Return the unchanged metrics of one file whose keys contain a part."""
     rows = [
         (f"`{m.key}`", f"{m.value:.4g} {m.unit}", "" if m.error is None else f"{m.error:.1e}")
         for m in document.metrics
@@ -297,7 +298,7 @@ def every_metric(document: Document, having: str = "") -> str:
 
 
 def numerics_rule() -> str:
-    """What is measured of hard cases, and the bounds where a case names no other."""
+    """Return the quantities measured in hard cases, with their default bounds."""
     rows = [
         (name, quantity.unit, f"{quantity.bound:g}", f"{QUANTITIES[name + DOUBLE].bound:g}" if name != "wrong" else "0")
         for name, quantity in QUANTITIES.items()
@@ -307,7 +308,7 @@ def numerics_rule() -> str:
 
 
 def numerics_cases() -> str:
-    """Every hard case in words."""
+    """Return every hard case in words."""
     return table(
         ("case", "what it is", "expected", "what a person sees"),
         [(f"`{case.key}`", case.title, case.expected, case.seen) for case in CASES],
@@ -315,7 +316,7 @@ def numerics_cases() -> str:
 
 
 def numerics_errors(cpu: Document, gpu: Document) -> str:
-    """The errors of every hard case on both kinds of device, bounds in brackets where they are not the rule's."""
+    """Return the errors of every hard case on both kinds of device, with their bounds."""
     rows = []
     for case in CASES:
         for name in (x for x in QUANTITIES if f"{case.key}.{x}" in cpu.values and not x.endswith(DOUBLE)):

@@ -1,9 +1,9 @@
-"""A third room: what is chosen after the second one has spoken is confirmed or refuted here.
+"""A third room, in which the choice made after the second room's result is confirmed or refuted.
 
-The second room refuted the first choice of the rule, and the consensus was changed then. What is chosen now needs a
-room that nobody has looked at: a kitchen with many small things, twenty classes, photographed from five places as one
-does with a tripod, not from a path. It was written before the changed consensus was run on the grid, and no choice may
-look at it.
+The second room refuted the first choice of the rule, and the consensus was then changed. The next choice needs a room
+that has not been examined: a kitchen with many small objects and twenty classes. Its cameras are at five places, as on
+a tripod, instead of on a path. It was written before the changed consensus was run on the grid, and must not be used to
+choose.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from research.made_room import Part, Plan, built, look
 from research.synthetic_scenes import World, world_of_room
 
 LENGTH, WIDTH, HEIGHT = 4.2, 4.0, 2.5
-"""Of the floor in x and y, and of the walls, metres. It has no ceiling."""
+"""Sides of the floor in x and y, and height of the walls, in meters. There is no ceiling."""
 SEED = 23
 FIELD_OF_VIEW = 62.0
-"""Horizontal, degrees."""
+"""Horizontal field of view in degrees."""
 PLACES = ((-0.9, -1.5, 1.6), (1.5, -1.4, 1.35), (1.6, 0.2, 1.75), (-1.6, 0.1, 1.2), (0.1, -0.5, 1.95))
-"""Of the tripod, metres."""
+"""Positions of the tripod in meters."""
 
 
 def parts() -> list[Part]:
-    """All surfaces, one entry per class."""
+    """Return all surfaces, one entry per class."""
     table = union(
         place(cone(0.55, 0.55, 0.04, 0.01), 0, 0, 0.74),
         *(place(cone(0.03, 0.03, 0.72), 0.36 * math.cos(a), 0.36 * math.sin(a), 0.36) for a in (0.4, 1.97, 3.54, 5.11)),
@@ -83,7 +83,7 @@ PLAN = Plan(LENGTH, WIDTH, HEIGHT, tuple(parts()), SEED)
 
 
 def turns(count: int = 30, phase: float = 0.0, width: int = 320, height: int = 240) -> list[Camera]:
-    """Cameras on five places in turn, each turning between its photographs towards the middle and both sides of it."""
+    """Return cameras at five places in turn. Each turns between its images towards the center and both sides of it."""
     found = []
     for i in range(count):
         x, y, z = PLACES[i % len(PLACES)]
@@ -95,6 +95,6 @@ def turns(count: int = 30, phase: float = 0.0, width: int = 320, height: int = 2
 
 
 def third(num_gaussians: int = 40_000, views: int = 30, width: int = 320) -> World:
-    """The room as a world: twenty classes, 30 views, 5 held-out views between them."""
+    """Return the room as a world: twenty classes, 30 views, 5 held-out views between them."""
     size = width, width * 3 // 4
     return world_of_room("third", built(PLAN, num_gaussians), turns(views, 0.0, *size), turns(5, 0.45, *size))

@@ -36,7 +36,7 @@ CAPTURES = SHARED / "captures"
 
 
 def splat_options(name: str) -> SplatOptions:
-    """The cameras of a capture, in the world of its splatfacto run."""
+    """Return the cameras of a capture, in the world of its splatfacto run."""
     world = CAPTURES / "outputs" / name / "splatfacto" / "run" / "dataparser_transforms.json"
     return SplatOptions(
         transforms=CAPTURES / name / "transforms.json",
@@ -47,7 +47,7 @@ def splat_options(name: str) -> SplatOptions:
 
 
 def read_capture(name: str) -> tuple[list[View], list[View], Tensor, Tensor]:
-    """Training views, held-out views, points in the world of the cameras, and their colors in 0..1."""
+    """Return training views, held-out views, points in the world of the cameras, and their colors in 0..1."""
     options = splat_options(name)
     cameras = read_camera_file(options)
     world = read_world_transform(options.world_transform, cameras.applied_transform, cameras.applied_scale)  # type: ignore[arg-type]
@@ -64,7 +64,8 @@ def read_capture(name: str) -> tuple[list[View], list[View], Tensor, Tensor]:
 
 
 def first_splats(points: Tensor, colors: Tensor, scale: float) -> tuple[torch.nn.ParameterDict, dict[str, Any]]:
-    """Parameters by gsplat's names, as large as the distance to their neighbors, and an optimizer of each."""
+    """Return initial parameters by gsplat's names, with the distance to neighbors as size, and an optimizer for
+    each."""
     distance, _ = KDTree(points.numpy()).query(points.numpy(), k=4)
     size = torch.from_numpy(np.sqrt((distance[:, 1:] ** 2).mean(1)).clip(1e-6)).float().log()
     n = len(points)
@@ -83,7 +84,7 @@ def first_splats(points: Tensor, colors: Tensor, scale: float) -> tuple[torch.nn
 
 
 def render(splats: torch.nn.ParameterDict, view: View) -> tuple[Tensor, dict[str, Any]]:
-    """Image [H, W, 3] on black, and what gsplat's strategies read."""
+    """Return the image [H, W, 3] on black, and the data that gsplat's strategies need."""
     from gsplat import rasterization_2dgs  # noqa: PLC0415 (needs a GPU)
 
     camera = view.camera
@@ -97,7 +98,7 @@ def render(splats: torch.nn.ParameterDict, view: View) -> tuple[Tensor, dict[str
 
 
 def mean_psnr(splats: torch.nn.ParameterDict, views: list[View]) -> float:
-    """In dB, of the images in 0..1."""
+    """Return the mean PSNR of images in 0..1, in dB."""
     with torch.no_grad():
         errors = [(render(splats, view)[0].clamp(0, 1) - view.image.cuda() / 255).square().mean() for view in views]
     return float((-10 * torch.stack(errors).log10()).mean())

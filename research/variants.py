@@ -1,8 +1,8 @@
-"""The refinement's variants and other methods on one damaged observation, as scores of every class.
+"""Scores of all classes after variants of the refinement and other methods, on one damaged observation.
 
-Classes need no [N, 512] array: u_j t = sum_s E_js F_s t / (W_j ||f_j||). Votes copy rows of these scores; linear
-averaging of directions averages them, up to the length, which no arg-max sees (`research/tests/test_accuracy.py`
-compares both with `refine_variant`).
+No [N, 512] array is needed: u_j t = sum_s E_js F_s t / (W_j ||f_j||). Votes copy rows of these scores. Linear averaging
+of directions averages the scores, up to the length, which does not affect the arg max.
+`research/tests/test_accuracy.py` compares both with `refine_variant`.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ VARIANTS: tuple[Variant, ...] = get_args(Variant)
 
 
 class Scores(NamedTuple):
-    """What every Gaussian answers to K classes."""
+    """Cosines of every Gaussian with K classes."""
 
     cosine: Tensor
-    """[N, K], 0 without direction."""
+    """[N, K] cosines, or 0 without a direction."""
     valid: Tensor
-    """[N]"""
+    """[N] True for Gaussians with a direction."""
 
 
 def lifted_scores(lifted: Lifted, classes: Tensor) -> Scores:
-    """Cosines of the unrefined directions."""
+    """Return the cosines of the unrefined directions."""
     sums = lifted.evidence.rows.matmul(lifted.features @ classes.T.to(lifted.features))
     length = (lifted.scalars.weight * lifted.scalars.norm)[:, None]
     valid = lifted.scalars.norm > 0
@@ -41,7 +41,8 @@ def lifted_scores(lifted: Lifted, classes: Tensor) -> Scores:
 
 
 def only(neighbors: Neighbors, voters: Tensor | None) -> Neighbors:
-    """The neighbours of some Gaussians; the others have none, and so keep their direction. None: of all."""
+    """Return the neighbors of the Gaussians `voters`, or of all for None. Others have none, and keep their
+    direction."""
     if voters is None:
         return neighbors
     votes = torch.zeros(len(neighbors.index), 1, dtype=torch.bool, device=neighbors.index.device)
@@ -54,7 +55,7 @@ def refined_scores(
     variant: Variant, means: Tensor, lifted: Lifted, scores: Scores, neighbors: Neighbors,
     config: RefineConfig | None = None,
 ) -> Scores:  # fmt: skip
-    """Scores after one variant of `refine_variant`."""
+    """Return the scores after one variant of `refine_variant`."""
     config = config or RefineConfig()
     if variant == "none":
         return scores
@@ -81,18 +82,18 @@ def _average(reliability: Tensor, scores: Scores, neighbors: Neighbors, config: 
 
 
 def centre_evidence(world: World) -> Evidence:
-    """The idea of Occam's LGS on the cells of a world."""
+    """Return evidence by the idea of Occam's LGS, on the cells of a world."""
     return baselines.center_evidence(world.scene.means, world.cameras, list(world.cells.of_pixel), world.evidence)
 
 
 def top_evidence(world: World, top: int = baselines.TOP) -> Evidence:
-    """The idea of Dr.Splat on the cells of a world."""
+    """Return evidence by the idea of Dr.Splat, on the cells of a world."""
     rasterize = partial(rasterize_evidence, world.scene)
     return baselines.top_evidence(rasterize, world.cameras, list(world.cells.of_pixel), world.evidence, top)
 
 
 def median_scores(observed: Observed, classes: Tensor, gaussians: Tensor | None = None) -> Scores:
-    """The idea of VALA, of some or all Gaussians."""
+    """Return scores by the idea of VALA, for some or all Gaussians."""
     n, device = len(observed.evidence.rows), observed.features.device
     cosine = torch.zeros(n, len(classes), device=device)
     valid = torch.zeros(n, dtype=torch.bool, device=device)

@@ -1,12 +1,12 @@
-"""Times and sizes of ns-normlift-view: of its start, of its page in Chromium, of an answer and of a query over HTTP.
+"""Times and sizes of ns-normlift-view: its start, its page in Chromium, an answer, and a query over HTTP.
 
     python -m research.view               lifts the fox capture first
     python -m research.view --load-config outputs/room/normlift/demo/config.yml
 
-Chromium draws in software (SwiftShader) on the cores that the server uses too, in a window of 1300 x 800 pixels. Each
-load is that of a new browser, without anything in its cache. A press is Enter in the search box; the text encoder is
-loaded already. A frame counts once WebGL has finished it. The page draws a slow frame without outlines first, and adds
-them when it rests; both times are measured. Client programs speak the protocol of sessions, or HTTP.
+Chromium renders in software (SwiftShader), on the same cores as the server, in a window of 1300 x 800 pixels. Each load
+uses a new browser with an empty cache. A press is Enter in the search box, with the text encoder already loaded. A
+frame counts when WebGL has finished it. The page renders a slow frame without outlines first, and adds them when it is
+idle; both times are measured. Client programs use the protocol of sessions, or HTTP.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 PATIENCE = 180
-"""Seconds."""
+"""Longest wait in seconds."""
 COLOURS = ("orange", "crimson", "teal", "purple", "dark green", "sky blue", "yellow", "brown", "grey")
 BUNDLE = PAGE_FOLDER / "assets"
 REPEATS, SIZE = 5, (1300, 800)
@@ -58,7 +58,7 @@ _PICTURES = """() => {
   const of = (...names) => performance.getEntriesByType("measure").find(({name}) => names.includes(name))?.duration;
   return {colors: of("colors"), first: of("coarse", "picture"), full: of("picture"), outlined};
 }"""
-"""Milliseconds since the page was opened, or since a press: the page measures them."""
+"""Script that returns milliseconds since the page was opened, or since a press, as measured by the page."""
 _RENDERER = """() => {
   const gl = page.scene.renderer.getContext(), info = gl.getExtension("WEBGL_debug_renderer_info");
   return gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
@@ -67,32 +67,32 @@ _RENDERER = """() => {
 
 @dataclass(frozen=True)
 class ViewServer:
-    """A viewer of a run in a process of its own."""
+    """Viewer of a run in a separate process."""
 
     process: subprocess.Popen[str]
     port: int
     start_seconds: float
-    """Seconds until it said that the page can be opened."""
+    """Seconds until the server printed its address."""
 
     def worked(self) -> float:
-        """Seconds that processors have worked for it."""
+        """Return the processor time of the server in seconds."""
         ticks = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()[11:13]
         return sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
 
     def resident(self) -> int:
-        """Bytes of memory that it holds."""
+        """Return the memory of the server in bytes."""
         pages = Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]
         return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
     def run(self) -> str:
-        """The id of its run."""
+        """Return the id of the run."""
         with urlopen(f"http://127.0.0.1:{self.port}/api/runs") as answer:
             return json.load(answer)["runs"][0]["id"]
 
 
 @contextmanager
 def served(config: Path) -> Iterator[ViewServer]:
-    """A viewer of a run, which is stopped afterwards."""
+    """Start a viewer of a run, and stop it at the end of the context."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -111,7 +111,7 @@ def served(config: Path) -> Iterator[ViewServer]:
 
 
 class Client:
-    """A page without a browser: it knows the protocol of sessions, and counts bytes."""
+    """Page without a browser, which uses the protocol of sessions and counts bytes."""
 
     def __init__(self, line: ClientConnection) -> None:
         self._line, self._seq, self.bytes = line, 0, 0
@@ -123,7 +123,7 @@ class Client:
         self._line.send(json.dumps({"action": action, "value": value, "seq": self._seq}))
 
     def codes(self) -> int:
-        """Waits for the colors that answer the last action; how many there are."""
+        """Wait for the colors after the last action, and return their number."""
         while True:
             raw = self._line.recv(timeout=PATIENCE)
             self.bytes += len(raw)
@@ -133,7 +133,7 @@ class Client:
                     return len(raw) - 4 - length
 
     def rest(self, quiet: float = 0.5) -> None:
-        """Reads what still comes, until nothing has for some seconds."""
+        """Read messages until none has arrived for `quiet` seconds."""
         while True:
             try:
                 self.bytes += len(self._line.recv(timeout=quiet))
@@ -141,7 +141,7 @@ class Client:
                 return
 
     def ask(self, prompt: str) -> tuple[float, int]:
-        """Seconds from the press to the answer, and all bytes until then."""
+        """Return the seconds from the press to the answer, and the bytes of all messages until then."""
         self.rest()
         self.bytes, start = 0, time.perf_counter()
         self.act("ask", {"line": prompt})
@@ -150,7 +150,7 @@ class Client:
 
 
 def seconds_to_load(port: int) -> tuple[float, float]:
-    """Seconds from opening the page in a new browser until it shows the scene, coarse and at full resolution."""
+    """Return the seconds until a page in a new browser shows the scene, coarsely and at full resolution."""
     with chromium() as browser:
         page = opened(browser, port)
         until(page, _FULL)
@@ -159,7 +159,7 @@ def seconds_to_load(port: int) -> tuple[float, float]:
 
 
 def until(page: Page, expression: str) -> None:
-    """Waits until an expression holds in the page, whose policy for scripts forbids Playwright's own way to wait."""
+    """Wait until an expression is true in the page, whose policy for scripts forbids Playwright's own function."""
     deadline = time.monotonic() + PATIENCE
     while not page.evaluate(expression):
         if time.monotonic() > deadline:
@@ -168,7 +168,7 @@ def until(page: Page, expression: str) -> None:
 
 
 def opened(browser: Browser, port: int) -> Page:
-    """The page in a tab of its own."""
+    """Return the page in a new tab."""
     page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
     page.set_default_timeout(1e3 * PATIENCE)  # software WebGL takes seconds per frame of a large scene
     page.goto(f"http://127.0.0.1:{port}", wait_until="domcontentloaded")
@@ -176,23 +176,23 @@ def opened(browser: Browser, port: int) -> Page:
 
 
 class PressTimes(NamedTuple):
-    """Seconds from each press of Enter."""
+    """Seconds from each press of Enter to several events."""
 
     colors: list[float]
-    """Until the colors are handed to WebGL."""
+    """Seconds until the colors are passed to WebGL."""
     first: list[float]
-    """Until the first changed picture is drawn."""
+    """Seconds until the first changed image is rendered."""
     full: list[float]
-    """Until the picture at full resolution is drawn."""
+    """Seconds until the image at full resolution is rendered."""
     outlined: list[float]
-    """Until the picture has its outline too."""
+    """Seconds until the image also has its outline."""
     untouched: list[float]
     """Duration of a frame at full resolution without any change."""
     renderer: str
 
 
 def pressed(port: int, prompts: Sequence[str]) -> PressTimes:
-    """Times in Chromium of all prompts but the first."""
+    """Return the times in Chromium of all prompts except the first."""
     found: list[dict[str, float]] = []
     with chromium() as browser:
         page = opened(browser, port)
@@ -212,7 +212,7 @@ def pressed(port: int, prompts: Sequence[str]) -> PressTimes:
 
 
 def known_prompt(port: int, run: str, prompt: str, arrays: str) -> list[float]:
-    """Seconds of some queries over one HTTP connection, after a first one."""
+    """Return the seconds of some queries over one HTTP connection, after a first one."""
     line, seconds = HTTPConnection("127.0.0.1", port, timeout=PATIENCE), []
     body = json.dumps({"texts": [prompt], "arrays": arrays})
     for _ in range(51):
@@ -228,8 +228,10 @@ def known_prompt(port: int, run: str, prompt: str, arrays: str) -> list[float]:
 
 
 def million_bytes(share: float) -> float:
-    """Bytes per 1,000,000 Gaussians of SH degree 3 as the page gets them: those of the castle capture, of degree 1.
-    Coefficients of degrees 2 and 3 are those of degree 1 of other Gaussians, times a share.
+    """Return the bytes of the page's data per 1,000,000 Gaussians of SH degree 3.
+
+    The Gaussians are those of the castle capture, of degree 1. Coefficients of degrees 2 and 3 are those of degree 1 of
+    other Gaussians, multiplied by a factor.
     """
     splat, g = trained_state("castle"), torch.Generator().manual_seed(0)
     values = {name: splat[f"gauss_params.{name}"].detach().float() for name in NAMES}
@@ -243,17 +245,17 @@ def million_bytes(share: float) -> float:
 
 
 def add_spread(report: Report, key: str, values: Sequence[float], unit: str) -> None:
-    """Adds the median as `key`, and the least and the most."""
+    """Add the median as `key`, and the smallest and largest value."""
     report.add(key, statistics.median(values), f"{unit}, median of {len(values)}")
     report.add(f"{key}.least", min(values), unit)
     report.add(f"{key}.most", max(values), unit)
 
 
 def add_view(report: Report, config: Path, prompts: Sequence[str] = COLOURS, *, picture: bool = True) -> None:
-    """Adds the metrics of a lifted run.
+    """Add the metrics of a lifted run.
 
     Args:
-        picture: time Chromium too, which takes minutes for large scenes without a GPU.
+        picture: True to measure Chromium too, which takes minutes for large scenes without a GPU.
     """
     start = time.perf_counter()
     with served(config) as server:
@@ -288,7 +290,7 @@ def add_view(report: Report, config: Path, prompts: Sequence[str] = COLOURS, *, 
 
 
 def fox_run(folder: Path) -> Path:
-    """config.yml of the fox capture, lifted from some of its views at half their size, by colours."""
+    """Return the config.yml of the fox capture, lifted with colors from some of its views at half their size."""
     from normlift_ns.cli.lift import NormLift  # noqa: PLC0415
     from normlift_ns.options import LiftOptions, SourceOptions  # noqa: PLC0415
 
@@ -303,7 +305,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--load-config", type=Path, help="lifted run; by default the fox capture is lifted first")
     parser.add_argument("--prompts", nargs="+", default=COLOURS)
-    parser.add_argument("--no-picture", action="store_true", help="leave Chromium out")
+    parser.add_argument("--no-picture", action="store_true", help="do not measure Chromium")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     found = Report("view")

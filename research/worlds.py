@@ -4,9 +4,9 @@
     python -m research.worlds --processes 16      the same on 16 cores
     python -m research.worlds --quick             two worlds and four rotations of each capture
 
-The cameras of a capture are written in the world of its splat, which is right. Then the splat is turned and scaled by
-what `--world-transform auto` tries, and the cameras are turned by random rotations that are not tried. pale is the fox
-with a tenth of its contrast and with noise of two levels, as sensors add it.
+The cameras of a capture are written in the world of its splat, which is the right one. Then the splat is rotated and
+scaled by the transforms that `--world-transform auto` tries. The cameras are also rotated by random rotations that it
+does not try. pale is the fox with a tenth of its contrast, and with noise of two levels like that of sensors.
 
 Keys: <capture>.right.margin, .psnr and .mean_color of the right world; <capture>.wrong.margin, the largest of the wrong
 ones; <capture>.<world>.found, .margin in the first world, .psnr in the found one, and .seconds of the search;
@@ -53,7 +53,7 @@ from tests.data.scene_files import in_file_world, in_world, ply_columns, write_c
 CAPTURES = ("fox", "castle", "tabletop", "pale")
 FACTORS = (1.0, 1.01, 1.02, 1.05, 1.5)
 ROTATIONS = 50
-"""Random rotations of each capture."""
+"""Number of random rotations of each capture."""
 _QUARTER = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 TURNS = {
     "half_x": np.diag([1.0, -1, -1]),
@@ -107,7 +107,7 @@ class Case:
         return scene, watch
 
     def worlds(self) -> Iterator[tuple[str, str, np.ndarray | None, dict[str, Any]]]:
-        """Yield key and part of the name of every world, the change of the splat, and options of its cameras."""
+        """Yield the key and part of the name of every world, the change of the splat, and options for its cameras."""
         for key, linear in TURNS.items():
             yield key, "", _square(linear), {}
         write_transforms(self.folder / "opencv.json", with_opengl_axes(self.frames), [])
@@ -144,7 +144,7 @@ def _pale_image(frame: Frame, folder: Path) -> Path:
 
 
 def _first(case: Case, matrix: np.ndarray | None, options: dict[str, Any]) -> Alignment:
-    """Return the alignment without a search."""
+    """Return the alignment in the first world, without a search."""
     scene, _ = case.open(matrix, **{**options, "world_transform": None})
     return measure_alignment(scene, explain=False)
 
@@ -186,7 +186,7 @@ def measure_world(case: Case, number: int) -> Rows:
 
 
 def measure_rotations(case: Case, numbers: range) -> Rows:
-    """Return for random rotations whether they are taken, and their margins."""
+    """Return, for random rotations, whether a world is accepted, and its margin."""
     generator = np.random.default_rng(CAPTURES.index(case.name))
     turns, rows = generator.normal(size=(ROTATIONS, 4)), []
     for number in numbers:
@@ -219,7 +219,7 @@ def _limit_threads(count: int) -> None:
 
 @cache
 def _case(name: str) -> Case:
-    """Return the case of a capture, one in every process, with compiled kernels."""
+    """Return the case of a capture, cached in each process, with compiled kernels."""
     folder = tempfile.TemporaryDirectory()
     atexit.register(folder.cleanup)
     case = Case(name, Path(folder.name))

@@ -269,7 +269,7 @@ _SIDE_PER_LINE_WIDTH = 320
 def draw_outlines(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "r h w"]) -> UInt8[Tensor, "h w 3"]:
     """Darken an image outside all masks, and draw an orange line along the inner edge of each mask.
 
-    In images of 480 pixels or more, the line has a dark rim.
+    In images with a longer side of 480 pixels or more, the line has a dark rim inside the masks.
 
     >>> image = torch.full((9, 9, 3), 200, dtype=torch.uint8)
     >>> mask = torch.zeros(1, 9, 9, dtype=torch.bool)
@@ -406,7 +406,7 @@ class RecordedVotes:
         """Typical disagreement of the views about a Gaussian, 1 minus the median norm of the mean features.
 
         It is the mean of the values before and after the consensus, or the value after the consensus if the value
-        before it is unknown.
+        before it is unknown. If no Gaussian has evidence, it is 1.
         """
         scalars = self.field.scalars
         if not bool((scalars.norm > 0).any()):
@@ -452,7 +452,7 @@ class RecordedVotes:
 
     @cached_property
     def _source(self) -> FeatureSource:
-        """Feature source of the lift. Encoders and SAM only read the cache; they load no network."""
+        """Feature source of the lift. SAM and all encoders except color only read the cache; they load no network."""
 
         def is_quick(part: Any) -> bool:
             return isinstance(part, ColorEncoder) or not (hasattr(part, "text") or hasattr(part, "checkpoint"))
@@ -475,7 +475,11 @@ class RecordedVotes:
             )
 
     def _option(self, name: str, kind: type, default: Any) -> Any:
-        """Return an option of the lift, or the default if the manifest does not record it."""
+        """Return an option of the lift, or the default if the manifest does not record it.
+
+        Raises:
+            InputError: If the recorded value has the wrong type.
+        """
         options = self.field.manifest.get("options")
         value = options.get(name, default) if isinstance(options, Mapping) else default
         if not isinstance(value, (int, float) if kind is float else kind):

@@ -11,10 +11,10 @@ across their border::
 Here, m is the median number of images per pair. The square root estimates the length of the border, which is a line on
 a surface. This denominator keeps two parts separate if only a few pairs connect them. Initially, every Gaussian is a
 part. Each part joins the part with the largest affinity if that part is larger. This is repeated for affinities of at
-least 0.95, then 0.9, and so on down to 0.5. The method corresponds to the ultrametric contour map of image segmentation
-(Arbelaez et al., "Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of
-edge strengths. Random borders of a segmentation differ between images, so the affinity across them is high. Borders of
-objects are the same in all images, so the affinity across them is low.
+least 0.95, then 0.9, and so on down to 0.5. The method corresponds to the ultrametric contour map of Arbelaez et al.
+("Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of edge strengths.
+Random borders of a segmentation differ between images, so the affinity across them is high. Borders of objects are the
+same in all images, so the affinity across them is low.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Inventory:
             ValueError: The inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
-            raise InputError(f"Object {number} does not exist. The objects are numbered from 1 to {len(self)}.")
+            raise InputError(f"Object {number} does not exist. The inventory has {len(self)} objects, numbered from 1.")
         return self.instance_id == number
 
 
@@ -358,8 +358,8 @@ def best_words(
 
     Some words are similar to everything. The cosines of each word are therefore standardized over the scene, and then
     those of each object over the words that are not names. The score of the best name must exceed a limit. If the
-    scores were normally distributed, `by_chance` pairs of an object and a name would exceed this limit. If all words
-    are names, the scores are standardized over all words, and the best name must also have the best score.
+    scores of 20 objects were normally distributed, `by_chance` pairs of an object and a name would exceed this limit.
+    If all words are names, the scores are standardized over all words, and the best name must also have the best score.
 
     Args:
         directions: Unit directions of the objects, from `mean_directions`.

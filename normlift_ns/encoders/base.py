@@ -42,7 +42,8 @@ class ViewFeatures:
     levels of an image, not only on the selected ones, so another selection can use the same cached evidence.
 
     Raises:
-        ValueError: If a type or shape is wrong, an id is out of range, or a feature row is not a unit vector.
+        ValueError: If a type, device or number of dimensions is wrong, an id is out of range, or a feature row is not a
+            unit vector.
     """
 
     labels: Int32[Tensor, "h w"]
@@ -196,7 +197,7 @@ class Encoder(TextEncoder, Protocol):
     ) -> Iterator[Float32[Tensor, "r d"]]:
         """Yield the result of `encode` for each view, in order. Results may differ from `encode` by rounding.
 
-        The iterator reads ahead in `views` only if it batches the regions of several views.
+        The iterator reads ahead in `views` if it batches the regions of several views or encodes views concurrently.
         """
         return (self.encode(image, labels) for image, labels in views)
 
@@ -246,7 +247,11 @@ class RegionFeatures:
             )
 
     def _segment(self, view: tuple[Tensor, str]) -> tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "levels depth h w"]]:
-        """Return the image on the CPU and its label maps; raise InputError if a selected level is missing."""
+        """Return the image on the CPU and its label maps.
+
+        Raises:
+            InputError: If the image is invalid, a selected level is missing, or no level of several is selected.
+        """
         image, name = view
         check_image(image, name)
         image = image.cpu()
@@ -298,7 +303,7 @@ def iterate_view_features(
 ) -> Iterator[ViewFeatures]:
     """Yield the features of several images in order. Results may differ from `source.view` by rounding.
 
-    The iterator requests images as needed. An encoder that batches regions of several images requests images ahead.
+    The iterator reads ahead in `images` if the source segments or encodes several images together.
     """
     if isinstance(source, RegionFeatures):
         return source.views(images)
@@ -460,8 +465,8 @@ class PrecomputedFeatures:
     """A `FeatureSource` of precomputed labels, region features and prompt embeddings, on the CPU."""
 
     views: Mapping[str, tuple[Int[Tensor, "h w"], Float[Tensor, "r d"]]]
-    """Labels and vectors by image name. Labels are rows of the vectors, or -1 for none. Vectors can have any norm; a
-    zero vector stands for no feature."""
+    """Labels and vectors by image name. A label is the index of a vector, or -1 for none. Vectors can have any norm; a
+    region with a zero vector has no feature."""
     texts: Mapping[str, Float[Tensor, " d"]]
     """Embedding of each prompt."""
     divisor: int = 1
@@ -510,9 +515,10 @@ def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: 
     Args:
         features: Either one (labels, vectors) pair per training image, in order, or a mapping from image names to such
             pairs, which may omit images.
-        texts: Vector of each prompt.
+        texts: Vector of each prompt, or None.
         names: Names of all training images.
     Raises:
+        ValueError: If `features` or `texts` has the wrong type.
         ValueError: If `features` is empty, or a list whose length differs from that of `names`.
         ValueError: If labels are not an integer matrix, or contain the id of a region without a vector.
         ValueError: If vectors are not finite or not [regions, D], with the same D for all images and prompts.
@@ -587,7 +593,7 @@ def _convert_text(text: str, values: Any) -> Tensor:
 
 
 def _to_floats(values: Any) -> Tensor:
-    """Return the values as a detached float32 or float64 tensor on the CPU."""
+    """Return the values as a detached float32 or float64 tensor on the CPU; raise InputError if they are not real."""
     try:
         tensor = values.detach().cpu() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, order="C"))
     except (TypeError, ValueError) as error:

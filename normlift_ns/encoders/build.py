@@ -134,12 +134,12 @@ def null_vectors(
 
     The vocabulary consists of the prompts that were supplied with precomputed features or in a file of text embeddings.
     For other lifts, it is `null_words`. The result is None if the vocabulary has fewer than five words, or the encoder
-    cannot embed them. If its weights are missing, the function also warns.
+    cannot embed them. It is also None, with a warning, if the weights of the encoder are missing.
 
     Args:
         encoder: Encoder settings from the manifest.
-        cache: Folder that keeps the vectors of `null_words`, because loading a network for them takes seconds. None:
-            compute them.
+        cache: Folder that caches the vectors of `null_words`, because loading a network for them takes seconds; None to
+            compute them each time.
     """
     kind, file = find_encoder_kind(encoder.get("encoder")), encoder.get("text_vectors")
     texts: TextEncoder = source

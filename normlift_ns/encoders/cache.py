@@ -86,11 +86,6 @@ class CachedRegions(_Cached):
             _write(path, "labels", labels)
         return labels.int()
 
-    def prepare(self) -> None:
-        """Prepare the segmentation if the cache folder does not exist."""
-        if not self.folder.exists():
-            self.inner.prepare()
-
     def path(self, image: UInt8[Tensor, "h w 3"], name: str) -> Path:
         """Return the cache path of the label maps of an image; the file may not exist."""
         files = [read_file(file, max_bytes=2**31) for file in self.files(name)]

@@ -241,7 +241,7 @@ def _bilinear_samples(
     """Return the positions and weights of bilinear interpolation of each square along one axis.
 
     The result has two entries, for the pixels before and after each sample. An entry contains the positions in the
-    image, the weights, and a mask that is True for pixels inside the box and False for pixels in the margin.
+    image, the weights, and a mask. The mask is True for pixels inside the box, and False for pixels in the margin.
     """
     center = (torch.arange(size, device=side.device) + 0.5) * (side[:, None].double() / size) - 0.5
     center = center.clamp(min=0)

@@ -185,7 +185,7 @@ def read_model_folder(path: Path, family: ModelFamily) -> ModelFolder:
 
 
 def _read(path: Path, family: ModelFamily) -> ModelFolder:
-    """Read a model folder. Error messages do not include its path."""
+    """Read a model folder; raise InputError, without its path in the message, if it cannot be used."""
     config = read_json(path / CONFIG_FILE)
     kind = config.get("model_type")
     if kind not in family.model_types:
@@ -208,7 +208,7 @@ def _other_architecture(origin: str, config: Mapping[str, Any], family: ModelFam
 
 
 def _sizes(values: object, where: str) -> dict[str, Any]:
-    """Check and return the sizes that a configuration contains."""
+    """Return the sizes that a configuration contains; raise InputError if one is invalid."""
     if values is None:
         return {}
     if not isinstance(values, Mapping):
@@ -241,7 +241,7 @@ def _number(value: object, name: str, minimum: float, maximum: float) -> float:
 
 
 def _pixels(path: Path, family: ModelFamily, kind: str) -> PixelNormalization:
-    """Read the pixel normalization of a model folder."""
+    """Read the pixel normalization of a model folder; raise InputError if it is missing or invalid."""
     names = [name for name in _PREPROCESSING_FILES if (path / name).is_file()]
     if len(names) == 0:
         raise InputError(f"{_PREPROCESSING_FILES[0]}, which describes image preprocessing, is missing")
@@ -267,7 +267,7 @@ def _pixels(path: Path, family: ModelFamily, kind: str) -> PixelNormalization:
 def _channels(
     settings: Mapping[str, Any], key: str, default: tuple[float, ...], minimum: float, file: str
 ) -> tuple[float, ...]:
-    """Return a preprocessing setting with one number per color channel."""
+    """Return a preprocessing setting with one number per color channel; raise InputError if it is invalid."""
     values = settings.get(key, list(default))
     if not isinstance(values, list) or len(values) != 3:
         raise InputError(f"{key} of {file} is {values!r:.40}, expected three numbers")
@@ -307,7 +307,7 @@ def _tokens(path: Path, family: ModelFamily) -> TokenPadding:
 
 
 def _weights(path: Path) -> tuple[Path, ...]:
-    """Return the weight files, either a single file or the shards that the index lists."""
+    """Return the weight file, or the shards that the index lists; raise InputError if a file is missing."""
     if (path / WEIGHTS_FILE).is_file():
         return (path / WEIGHTS_FILE,)
     if not (path / WEIGHTS_INDEX_FILE).is_file():
@@ -353,8 +353,8 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
     """Check the options as far as possible without torch.
 
     Raises:
-        InputError: If packages are missing or too old, an option applies only to another encoder, or the folder has
-            a different architecture.
+        InputError: If packages are missing or too old, or an option applies only to another encoder.
+        InputError: If the name is not a hub name, or the folder is incomplete, damaged or of a different architecture.
         FileNotFoundError: If the folder does not exist, or the network is not on this machine and the hub cannot be
             reached.
     """
@@ -399,7 +399,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 
     Raises:
         FileNotFoundError: If the network is not on this machine and cannot be downloaded.
-        InputError: If the network to download has a different architecture.
+        InputError: If config.json of the network to download is damaged or has a different architecture.
     """
     local = find_local_model(model)
     if local is not None:

@@ -88,7 +88,11 @@ class HuggingFaceNetwork:
         return self._finite(lambda: self._value_path(pixels))
 
     def texts(self, texts: Sequence[str]) -> Float[Tensor, "b d"]:
-        """Return unnormalized embeddings of texts, which `ModelFamily.preprocess_text` has prepared."""
+        """Return unnormalized embeddings of texts, which `ModelFamily.preprocess_text` has prepared.
+
+        Raises:
+            InputError: If the tokenizer returns a token that the network does not have, or embeddings are not finite.
+        """
         encoded = self.tokenizer.encode_batch(list(texts))
         vocab_size, largest = self.model.config.text_config.vocab_size, max(max(text.ids) for text in encoded)
         if largest >= vocab_size:
@@ -183,7 +187,12 @@ def load_huggingface_network(
 
 
 def _build_model(folder: huggingface.ModelFolder) -> Any:
-    """Build the model from the checked sizes and load its weights in float32."""
+    """Build the model from the checked sizes, and load its weights in float32.
+
+    Raises:
+        InputError: If the image sizes of the files differ, or a weight is not a float.
+        Exception: If the weights do not match the model, or cannot be read.
+    """
     transformers = importlib.import_module("transformers")
     name = _CLASSES[folder.model_type]
     config = getattr(transformers, f"{name}Config")(
@@ -211,7 +220,12 @@ def _build_model(folder: huggingface.ModelFolder) -> Any:
 
 
 def _load_tokenizer(folder: huggingface.ModelFolder, config: Any) -> Any:
-    """Load the tokenizer, and set it to pad or truncate texts to the length used in training."""
+    """Load the tokenizer, and set it to pad or truncate texts to the length used in training.
+
+    Raises:
+        InputError: If the tokenizer does not have the padding token.
+        Exception: If the file cannot be read.
+    """
     tokenizer = importlib.import_module("tokenizers").Tokenizer.from_file(str(folder.path / huggingface.TOKENIZER_FILE))
     length, tokens = cast(int, config.max_position_embeddings), folder.tokens
     pad_id = tokenizer.token_to_id(tokens.pad_token)

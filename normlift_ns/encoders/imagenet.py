@@ -3,7 +3,7 @@
 `imagenet_words.json`, which research/imagenet_words.py writes, contains the names and hypernyms of all classes from
 WordNet 3.0. A name, such as "red fox", stands for all classes with that name. A hypernym, such as "dog" or "furniture",
 stands for all classes below it. The last word of a name, such as "panda", stands for all classes whose names end in
-this word, unless the word is itself a name or a hypernym. For example, "dog" does not include hot dog.
+this word. This does not apply to words that are themselves names or hypernyms: "dog" does not include hot dog.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _AFTER_HEAD = re.compile(r"\b(?:of|on|in|with|at|under|by|near|behind|from|for|t
 def find_classes(prompt: str) -> list[int]:
     """Return the classes that a prompt names, in ascending order.
 
-    If the whole prompt is not known, everything from the first preposition or relative pronoun on is ignored. Of the
-    rest, the longest known phrase at the end counts.
+    If the whole prompt is not known, it is cut before the first preposition or relative pronoun. Then the longest known
+    phrase at its end counts.
 
     >>> find_classes("A red fox"), find_classes("two foxes in the snow"), find_classes("cup of tea")
     ([277], [277, 278, 279, 280], [968])
@@ -91,7 +91,7 @@ def _table() -> dict[str, Any]:
 
 @cache
 def _vocabulary() -> dict[str, tuple[int, ...]]:
-    """Return the classes of each normalized word."""
+    """Return the classes of each name, hypernym and last word of a name, all normalized."""
     known: dict[str, set[int]] = {}
     heads: dict[str, set[int]] = {}
     for number, names in enumerate(_table()["classes"].values()):

@@ -90,8 +90,8 @@ def read_segment_map(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
         )
     if segments.dtype.kind == "f" and segments.dtype.itemsize == 2 and bool((values >= _MAX_EXACT_HALF).any()):
         raise InputError(
-            f"segment map {path} is float16 and has ids of {_MAX_EXACT_HALF} or more, which float16 rounds; preprocess "
-            "the image again, and save the ids as float32"
+            f"segment map {path} is float16 and has ids of {_MAX_EXACT_HALF} or more, which float16 may have rounded; "
+            "preprocess the image again, and save the ids as float32"
         )
     past = values >= rows
     for invalid, problem in ((~finite, "that are not finite"), (past, "past the end of its table")):
@@ -174,7 +174,7 @@ def shorten_list(values: Sequence[object]) -> str:
 LangSplatLevel = Literal["default", "s", "m", "l", "sum"]
 _NESTED = "language_features"
 _CROP_TOLERANCE = 0.02
-"""Largest relative difference between the sides of a map and of its image that indicates another crop.
+"""Relative difference between the sides of a map and of its image below which the map counts as another crop.
 
 Undistortion causes such crops. Larger differences indicate another resolution.
 """
@@ -200,8 +200,8 @@ class LangSplat:
     texts: TextEncoder
     """Text encoder of the model that computed the features."""
     level: LangSplatLevel = "l"
-    """Channel to use, or "sum" for the sum of the vectors of all channels at each pixel, as in Splat Feature Solver. A
-    map with one channel is used as it is."""
+    """Channel to use, or "sum" for the normalized sum of the vectors of all channels at each pixel, as in Splat Feature
+    Solver. A map with one channel is used as it is."""
     missing: MissingFeatures = "error"
     """Handling of images without features: "error" raises an error, "skip" skips them with a warning."""
     resample: bool = False
@@ -212,7 +212,11 @@ class LangSplat:
 
     @cached_property
     def folder(self) -> Path:
-        """Folder that contains the files of the images: `root`, or a folder inside it."""
+        """Folder that contains the files of the images: `root`, or a folder inside it.
+
+        Raises:
+            FileNotFoundError: For the same reasons as the class.
+        """
         folders = [self.root, self.root / _NESTED, self.root / _NESTED / _NESTED]
         for folder in folders:
             if os.path.isdir(folder) and next(folder.glob("*_s.npy"), None) is not None:
@@ -267,6 +271,7 @@ class LangSplat:
 
         Raises:
             FileNotFoundError, ValueError: For the same reasons as `available` and `read_segment_map`.
+            ValueError: If the segment map may show another crop of the image, and `resample` is False.
         """
         files = self._files(name)
         table, valid = read_feature_table(files.features)
@@ -292,7 +297,10 @@ class LangSplat:
         return self.texts.text(prompts)
 
     def _files(self, name: str) -> _Files:
-        """Return the files of an image. LangSplat cuts image names at the first dot, other programs at the last."""
+        """Return the files of an image, or raise FileNotFoundError if it has none.
+
+        LangSplat cuts image names at the first dot, and other programs at the last.
+        """
         file = PurePosixPath(name)
         for stem in (file.stem, file.name.split(".")[0]):
             files = _Files(self.folder / f"{stem}_s.npy", self.folder / f"{stem}_f.npy")

@@ -78,7 +78,7 @@ def missing_patches_reason(model: str) -> str | None:
 
 
 def _folder() -> Path:
-    """Return the folder of the open_clip package."""
+    """Return the folder of the open_clip package; raise InputError if it is not installed."""
     spec = find_spec("open_clip")
     if spec is None or spec.origin is None:
         raise InputError(
@@ -168,9 +168,9 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
     """Check an architecture and its weights by name, without loading or downloading anything.
 
     Raises:
-        ValueError: If open_clip does not have the model or the weights tag, or the installed timm does not have the
-            model.
-        FileNotFoundError: If the name looks like a weight file that does not exist.
+        ValueError: If open_clip is not installed, does not have the model or the weights tag, or the installed timm
+            does not have the image encoder of the model. Also if the name of the weights is an existing folder.
+        FileNotFoundError: If the name of the weights can only be a path, and the path does not exist.
     """
     config, tags = open_clip_model_config(model), import_open_clip_module("pretrained")
     if config is None:
@@ -197,8 +197,9 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
 def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
     """Return the weight file, downloaded if necessary, and its training settings.
 
-    The settings are "mean" and "std" of the training images, and "quick_gelu". A local file gets "mean" and "std" of
-    the architecture's published weights, if there are any, and the activation that the architecture specifies.
+    The settings are "mean" and "std" of the training images, and "quick_gelu", as far as open_clip's table has them. A
+    local file gets "mean" and "std" of the first published weights of the architecture. It gets no "quick_gelu", so the
+    configuration of the architecture sets the activation.
 
     Raises:
         FileNotFoundError: If the weights are not in the local cache and cannot be downloaded.
@@ -216,7 +217,10 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
 
 
 def find_local_clip_weights(model: str, pretrained: str) -> tuple[Path | None, dict[str, Any]]:
-    """Return the weight file, or None if it is not on this machine, and the settings as in `find_open_clip_weights`."""
+    """Return the weight file, and the settings as in `find_open_clip_weights`.
+
+    The file is None if `pretrained` is not a local file and the hub cache does not have its weights.
+    """
     table = import_open_clip_module("pretrained")
     if os.path.isfile(pretrained):
         tags = table.list_pretrained_tags_by_model(model)

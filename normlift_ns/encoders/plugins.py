@@ -1,7 +1,7 @@
 """Adapters for encoders and mask sources of other packages.
 
 An adapter checks the results of its plugin. Unexpected exceptions become errors that name the plugin. InputError,
-FileNotFoundError and MemoryError pass unchanged.
+FileNotFoundError, MemoryError and torch.OutOfMemoryError pass unchanged.
 """
 
 from __future__ import annotations

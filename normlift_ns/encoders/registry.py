@@ -76,7 +76,8 @@ class EncoderKind:
     words: Callable[[], Sequence[str]] = tuple
     """Function that returns the words that name objects in an inventory, or () if there are none."""
     suggested: tuple[float, float] = (0.4, 0.8)
-    """Range of suggested thresholds, on a scale from 0 at the median relevancy to 1 at the top relevancy."""
+    """Range of suggested thresholds. 0 is the median relevancy, and 1 is the relevancy that 20 Gaussians exceed, or one
+    in a thousand if these are fewer."""
     present_from: tuple[float, float] | None = None
     """Lower limits, for a weak match and for a match, on the cosine that one Gaussian in a thousand exceeds. None: the
     null vocabulary, or the relevancy rule, has the limits."""
@@ -89,7 +90,7 @@ class EncoderKind:
     """Function that returns True if the default weights and the packages of the encoder are on this machine.
     `--encoder auto` skips a built-in encoder if it returns False."""
     paths: tuple[str, ...] = ()
-    """Names of options that can be the path of a file or folder. Runs store them as absolute paths."""
+    """Names of options that can be the path of a file or folder. Runs store existing paths as absolute paths."""
 
 
 _DIGEST_PREFIXES = ("xxh3_128:", "blake2b:")
@@ -106,8 +107,8 @@ def _make_encoder(options: SourceOptions, device: str) -> Encoder:
 def _make_texts(
     options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
 ) -> CachedTextEncoder:
-    """Make the text encoder of a lifted run; see `EncoderKind.texts`. A local weight file is read in full each
-    time."""
+    """Make the text encoder of a lifted run; see `EncoderKind.texts`. To compute its digest, a local weight file is
+    read in full each time."""
     from normlift_ns.encoders.text_files import CachedTextEncoder, open_clip_text_identity  # noqa: PLC0415 (needs numpy)
 
     model, pretrained, template = options.encoder_model, options.encoder_pretrained, options.prompt_template
@@ -312,7 +313,8 @@ def _options_of_clip(options: SourceOptions) -> list[str]:
 def with_encoder(options: SourceOptions) -> SourceOptions:
     """Return the options with "auto" replaced by the preferred encoder on this machine.
 
-    The encoder is `open_clip` if its options are set, or for LangSplat's features, which OpenCLIP computed.
+    The encoder is `open_clip` for LangSplat's features, which OpenCLIP computed, and if `encoder_model`,
+    `encoder_pretrained` or `prompt_template` differs from its default.
     """
     if options.encoder != "auto":
         return options
@@ -365,8 +367,9 @@ def make_encoder(options: SourceOptions, device: str = "cpu") -> Encoder:
         device: Device of the network, such as "cuda"; results are always on the CPU.
     Raises:
         ValueError: If the encoder, the model or the weights tag is unknown, or the prompt template has no placeholder.
-            Also if an encoder of another package rejects the options.
-        FileNotFoundError: If a weight file does not exist.
+        ValueError: If an option does not apply to the encoder, or a required package is missing or too old.
+        ValueError: If an encoder of another package rejects the options.
+        FileNotFoundError: If a weight file or model folder does not exist.
     """
     from normlift_ns.encoders.plugins import PluginEncoder  # noqa: PLC0415 (needs torch)
 

@@ -62,14 +62,20 @@ UNIT_TOLERANCE = 1e-3
 
 
 def check_prompts(prompts: Sequence[str]) -> None:
-    """Raise ValueError unless `prompts` is a list of at least one prompt and no prompt is empty."""
+    """Raise ValueError unless `prompts` is a sequence of one or more prompts that are not blank.
+
+    A prompt must be a string without null characters and surrogates.
+    """
     if isinstance(prompts, str):
         raise InputError(f"prompts must be a list of strings, got the single string {prompts!r}; write [{prompts!r}]")
     if len(prompts) == 0:
         raise InputError('no prompt is given; name at least one object to search for, for example --text "orange"')
     for prompt in prompts:
         if not isinstance(prompt, str) or re.search("[\0\ud800-\udfff]", prompt):
-            raise InputError(f"a prompt must be a string of valid characters, got {prompt!r:.60}")
+            raise InputError(
+                f"a prompt must be a string of valid characters, without null characters and surrogates; got "
+                f"{prompt!r:.60}"
+            )
     empty = [i for i, prompt in enumerate(prompts) if not prompt.strip()]
     if len(empty) > 0:
         raise InputError(
@@ -204,7 +210,8 @@ def _entries(archive: zipfile.ZipFile) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the prompts and vectors of an archive without checking them, except for their declared sizes.
 
     Raises:
-        ValueError: If two entries have the same name, or an entry is too large or not an array.
+        ValueError: If two entries have the same name, the archive or an entry is too large, or an entry is not an
+            array.
         Exception: If zipfile cannot read the archive.
     """
     entries = archive.infolist()

@@ -129,7 +129,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that contains an object.
 
     Raises:
-        InputError: If the file does not exist, is not JSON, or does not contain an object.
+        InputError: If the file does not exist, is larger than 128 MiB, is not JSON, or does not contain an object.
     """
     if not path.is_file():
         raise InputError(f"{path.name} is missing" if not os.path.lexists(path) else f"{path.name} is not a file")
@@ -153,7 +153,7 @@ def check_not_local(name: str, parts: int, subject: str, problem: str, remedy: s
         problem: Description of an existing file or folder in messages.
         remedy: End of messages.
     Raises:
-        InputError: If the path exists, or the name is not a valid hub name.
+        InputError: If the path exists, or `parts` is 2 and the name does not have the form OWNER/NAME.
         FileNotFoundError: If the name can only be a path, and the path does not exist.
     """
     if os.path.lexists(name):

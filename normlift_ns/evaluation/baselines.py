@@ -226,7 +226,7 @@ def _heaviest_of_rays(weights: SparseRows, pixels: int, top: int) -> tuple[Tenso
 def iter_medians(
     evidence: Evidence, features: Float[Tensor, "s d"], gaussians: Int[Tensor, " m"] | None = None, *, steps: int = 10
 ) -> Iterator[tuple[Int[Tensor, " b"], Float[Tensor, "b d"]]]:
-    """Yield (Gaussians, unit directions) as in VALA, block by block, with direction 0 without evidence.
+    """Yield (Gaussians, unit directions) as in VALA, block by block; Gaussians without evidence have the direction 0.
 
     Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median of the features
     of the other views by cosine distance. It is computed by Weiszfeld iterations with weights evidence / (1 - cosine),

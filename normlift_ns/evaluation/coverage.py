@@ -78,7 +78,8 @@ def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], s
     """Return the names of the lifted images, and of the images without features.
 
     Raises:
-        ValueError: If the manifest does not record them, or the scene no longer has some of the lifted images.
+        ValueError: If the record in the manifest is missing or damaged, or the scene no longer has some of the lifted
+            images.
     """
     names = list(scene.train.names)
     try:
@@ -91,8 +92,8 @@ def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], s
         used = [names[i] for i in indices] if len(indices) == counts.views else None
     if used is None:
         raise InputError(
-            "the run is from an older version and does not record which images had no features; lift the scene again "
-            "with ns-normlift"
+            "the run is from an older version and does not record which images were lifted; lift the scene again with "
+            "ns-normlift"
         )
     if not set(used) <= set(names):
         raise InputError(
@@ -106,7 +107,7 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
     """Return at most `MAX_IMAGES` lifted and `MAX_IMAGES` other images of a scene, evenly spaced.
 
     Raises:
-        ValueError: If the manifest does not record the lifted images, or the scene no longer has some of them.
+        ValueError: For the same reasons as `lifted_names`.
     """
     used, unusable = lifted_names(scene, manifest)
     train, held_out = (list(zip(views.names, views.cameras)) for views in (scene.train, scene.held_out))
@@ -140,7 +141,7 @@ class WeakRegion:
     centre: list[float]
     """Center of the region as x, y and z, in scene units."""
     box: dict[str, list[float]]
-    """Corners "min" and "max" of the bounding box of the centers, in scene units."""
+    """Corners "min" and "max" of the bounding box of the Gaussian centers, in scene units."""
     share: float
     """Share of the total surface of all Gaussians that lies in the region, in 0..1."""
     reliability: float
@@ -530,7 +531,8 @@ def look_at(
 ) -> Camera:
     """Return a camera that faces a target, with a centered principal point as in ns-render.
 
-    The focal length is the vertical one of `like`. Its sides are rounded down to even numbers of pixels.
+    The focal length is the vertical one of `like`. The width and height are those of `like`, rounded down to even
+    numbers of pixels.
     """
     width, height = (max(2, side - side % 2) for side in (like.width, like.height))  # videos need even sizes
     focal = float(like.K[1, 1])
@@ -771,7 +773,8 @@ def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str |
         min_reliability: Smallest R of a reliable Gaussian, in 0..1.
         device: Device for the rasterization (default: that of the run).
     Raises:
-        ValueError: If the run does not record the lifted images, or no Gaussian is visible in the images.
+        ValueError: If `min_reliability` is not in 0..1.
+        ValueError: For the same reasons as `lifted_names`, or if no image shows a Gaussian.
 
     >>> from normlift_ns import coverage, open_run
     >>> run = open_run(config)
@@ -786,7 +789,7 @@ def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str |
 def coverage_of(
     scene: Scene, field: SemanticField, *, min_reliability: float = RELIABLE, device: str = "cpu"
 ) -> Coverage:
-    """Compute `coverage` of a scene and its semantic field."""
+    """Compute `coverage` of a scene and its semantic field. Raises the same errors."""
     check_number("min_reliability", min_reliability)
     images = study_images(scene, field.manifest)
     power, vote = field.manifest.get("options", {}).get("weight_power", 1), recorded_vote(field.manifest)

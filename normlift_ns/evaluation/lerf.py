@@ -87,8 +87,8 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
     """Read a label file, and fill its polygons after scaling them to the size of the image.
 
     Raises:
-        ValueError: If the file has the wrong format, or labels an image with a different aspect ratio. The message
-            names the file.
+        ValueError: If the file has the wrong format, labels an image whose aspect ratio differs by more than 1 %, or
+            has a polygon outside the image. The message names the file.
     """
     try:
         document = read_document(file, _File)

@@ -60,7 +60,7 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the file is not a PLY file, is damaged, or has no labels.
+        ValueError: If the file is not a PLY file, is damaged, or has no label with an id in `NYU40`.
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(
@@ -138,6 +138,9 @@ def evaluate_scannet(scenes: Sequence[SceneLabels], options: ScannetOptions) -> 
     """Compute mIoU and mAcc of every class set, averaged over scenes.
 
     Results with the suffix _none or _first use the other choice of `without_direction`.
+
+    Raises:
+        ValueError: If no Gaussian can be scored with one of the class sets.
     """
     min_opacity, without_direction = options.min_opacity, options.without_direction
     other = _OTHER[without_direction]

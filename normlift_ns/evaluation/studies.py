@@ -205,9 +205,10 @@ def variant_votes(variants: Mapping[str, Variant], owns: Sequence[Vote]) -> Iter
 
 
 def sweeps(owns: Sequence[Vote]) -> Iterator[list[Vote]]:
-    """Yield the votes with each value of `SWEEPS`, its default and the values of the runs, one vote per run.
+    """Yield the votes with each value of each parameter, one vote per run.
 
-    Other parameters keep the values of the run. Labels mark the default and the values of the runs.
+    The values are those of `SWEEPS`, the default and the values of the runs. Other parameters keep the values of the
+    run. Labels mark the default and the values of the runs.
     """
     for parameter, values in SWEEPS.items():
         default = default_value(parameter, owns[0].config.vote)

@@ -29,7 +29,7 @@ WEIGHTS_FILE = SAM_WEIGHT_FILES[0]
 _MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
 """Upper bounds on numbers of layers, labels and entries, on all other numbers of a config, and on its nesting depth."""
 _MIN_TORCH = "2.6"
-_ALTERNATIVE = "use the original SAM with --regions sam --sam-model sam_vit_h_4b8939.pth (a file published by Meta)"
+_ALTERNATIVE = "lift with the original SAM: --regions sam --sam-model sam_vit_h_4b8939.pth (a file published by Meta)"
 _SAM_CONFIGS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
 _NOT_SIZES = re.compile(
     r"(?s)_|.*attn_impl|(auto_map|quantization_config|architectures|dtype|torch_dtype|transformers_version)\Z"
@@ -95,7 +95,7 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
     """Return the network that the config.json of a folder describes.
 
     Raises:
-        ValueError: If config.json is missing or describes none of `kinds`.
+        ValueError: If config.json is missing, is damaged, or describes none of `kinds`.
     """
     model_type = read_json(folder / CONFIG_FILE).get("model_type")
     kind = kinds.get(model_type) if isinstance(model_type, str) else None
@@ -109,7 +109,7 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
 
 
 def check_versions(kind: SamFamily) -> None:
-    """Raise InputError if the installed torch or transformers is too old for a network."""
+    """Raise InputError if the installed torch or transformers is too old for a network other than the original SAM."""
     if kind is not SAM:
         weights.check_packages(kind.name, {"torch": _MIN_TORCH, "transformers": kind.min_transformers}, _ALTERNATIVE)
 
@@ -157,7 +157,7 @@ def _quiet(transformers: Any) -> Iterator[None]:
 
 
 def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
-    """Return the parts of a config of a network, with only the entries that are sizes."""
+    """Return the parts of a config of a network, with only the entries that are sizes; raise InputError if invalid."""
     own = config if kind.config_key is None else config.get(kind.config_key)
     parts = {name: own.get(name) for name in kind.config_parts} if isinstance(own, Mapping) else {}
     for name, part in parts.items():
@@ -277,8 +277,8 @@ def load_sam_checkpoint(checkpoint: str) -> tuple[SamFamily, Any]:
 
     Raises:
         FileNotFoundError: If the checkpoint is not on this machine and cannot be downloaded.
-        ValueError: If the checkpoint is damaged, its network does not accept points, or the installed torch or
-            transformers is too old.
+        ValueError: If the checkpoint is damaged, its network does not accept points, or torch or transformers is
+            missing or too old.
     """
     path = locate_sam(checkpoint, POINT_PROMPT_FAMILIES)
     folder = transformers_folder(path)
@@ -390,8 +390,8 @@ def transformers_name(name: str) -> str:
 def config_from_weights(state: Mapping[str, Tensor]) -> Any:
     """Return the SamConfig of transformers for a file published by Meta, derived from the shapes of its parameters.
 
-    The shapes do not determine the epsilon and the number of heads (eight) of the mask decoder. These values are the
-    same in all of Meta's files.
+    The shapes do not determine the number of heads (eight) of the mask decoder and the epsilon of its layer norms
+    (1e-5). These values are the same in all of Meta's files.
     """
     shape = {name: tuple(value.shape) for name, value in state.items()}
     _, grid, _, width = shape["image_encoder.pos_embed"]

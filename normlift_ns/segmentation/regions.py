@@ -147,7 +147,7 @@ class LabelFiles(RegionDefaults):
     suffix .npy. All pixels with the same value form one region, even if they are not connected.
 
     Raises:
-        FileNotFoundError: If the folder does not exist.
+        FileNotFoundError: If the folder does not exist, or is not a folder.
     """
 
     folder: Path
@@ -172,8 +172,9 @@ class LabelFiles(RegionDefaults):
 
     def __post_init__(self) -> None:
         if not os.path.isdir(self.folder):
+            problem = "is not a folder" if os.path.lexists(self.folder) else "does not exist"
             raise FileNotFoundError(
-                f"the folder of {self.description}s {self.folder} does not exist ({self.flag}); give a folder with one "
+                f"the folder of {self.description}s {self.folder} {problem} ({self.flag}); give a folder with one "
                 "PNG or NPY file per image"
             )
 
@@ -222,9 +223,8 @@ class LabelFiles(RegionDefaults):
         """Return the regions of an image; see `Regions.labels`.
 
         Raises:
-            FileNotFoundError: If the label map does not exist.
-            ValueError: If a map cannot be read, or has color channels or fractional values.
-            ValueError: If a map and its image differ in size, and `resample` is False.
+            FileNotFoundError, ValueError: For the same reasons as `values`.
+            ValueError: If a map and its image differ in size, unless `resample` is True or `divisor` explains it.
         """
         path, maps = self.path(name), self.values(name)
         height, width = image.shape[:2]
@@ -252,8 +252,9 @@ class LabelFiles(RegionDefaults):
         """Read the label maps of an image, [levels, H, W], with their stored integer type unless `undistort` is given.
 
         Raises:
-            FileNotFoundError: If the label map does not exist.
-            ValueError: If a map cannot be read, or has color channels or fractional values.
+            FileNotFoundError, ValueError: For the same reasons as `path`.
+            ValueError: If the file cannot be read, has color channels, or has values that are not integers.
+            ValueError: If a PNG file is grayscale with 2 or 4 bits, which readers scale.
         """
         path = self.path(name)
         what = f"{self.description} {path}"
@@ -405,7 +406,10 @@ class _Grid:
         return cls(rows, columns, math.ceil(height / rows), math.ceil(width / columns), side)
 
     def cells(self, image: UInt8[Tensor, "h w 3"]) -> Float32[Tensor, "cells 6 y x"]:
-        """Return CIELAB / compactness, position relative to the cell's middle, and 1, or 0 for pixels without color."""
+        """Return six values per pixel: CIELAB / compactness, the position relative to the middle of the cell, and 1.
+
+        All six are 0 outside the image.
+        """
         rows, columns = torch.arange(image.shape[0]), torch.arange(image.shape[1])
         points = torch.zeros(6, self.rows * self.height, self.columns * self.width, device=image.device)
         inside = points[:, : len(rows), : len(columns)]
@@ -424,7 +428,7 @@ class _Grid:
     def nearest(
         self, points: Float32[Tensor, "cells 6 p"], sums: Float32[Tensor, "rows columns 6"]
     ) -> Int64[Tensor, "cells p"]:
-        """Return the number in its window, 0..8, of the center that is nearest to each point."""
+        """Return the nearest center of each point, as its index 0..8 in the window around the cell of the point."""
         centers = torch.where(sums[..., 5:] > 0, sums / sums[..., 5:].clamp(min=1), _FAR)
         around = (_windows(centers, _FAR) + self.shifts(points))[..., :5]
         lengths = around.square().sum(dim=2, keepdim=True)
@@ -503,7 +507,7 @@ def _connected_pieces(labels: Int32[np.ndarray, "h w"]) -> tuple[Int32[np.ndarra
 def _boundaries(
     pieces: Int32[np.ndarray, "h w"], small: Bool[np.ndarray, "h w"]
 ) -> tuple[Int32[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
-    """Return the pieces of each pixel of a small piece and of its neighbor in another piece."""
+    """Return pairs of adjacent pieces, one pair for each pixel of a small piece and each neighbor in another piece."""
     found = []
     for one, other, at in (
         (pieces[:, 1:], pieces[:, :-1], small[:, 1:]),

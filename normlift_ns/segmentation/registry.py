@@ -127,7 +127,7 @@ def _make_patches(options: SourceOptions, device: str) -> FeatureSource:
 
 
 PATCHES = MaskSource(_make_patches, has_features=True)
-"""Patches of the encoder's vision transformer."""
+"""Patches of a grid over the image, which the encoder embeds without masks."""
 
 
 SUPERPIXEL = MaskSource(_make("segmentation.regions:Superpixels", lambda o, device: (o.region_count or _COUNT, device)))

@@ -1,8 +1,8 @@
 """Automatic masks of SAM, SAM 2, SAM 2.1 and HQ-SAM.
 
-Images are resized as in Pillow, first along rows and then along columns, with weights of 22 bits and sums rounded to 8
-bits. This integer arithmetic below 2^31 gives the same result on all devices. If an image is reduced in height, Pillow
-13 can start with the columns to save work. Pixel values then differ by at most one.
+`resize_bilinear` resizes images like Pillow, first along rows and then along columns, with weights of 22 bits and sums
+rounded to 8 bits. This integer arithmetic below 2^31 gives the same result on all devices. If an image is reduced in
+height, Pillow 13 can start with the columns to save work. Pixel values then differ by at most one.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class MaskDecoder:
 
     @torch.no_grad()
     def __call__(self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "p 2"]) -> MaskPredictions:
-        """Return the masks of points (x, y), in pixels of the network input."""
+        """Return logits and predicted IoU of the masks of points (x, y), in pixels of the network input."""
         labels = torch.ones(1, len(points), 1, dtype=torch.int32, device=points.device)
         prompts, dense = self._model.get_prompt_embeddings(input_points=points[None, :, None], input_labels=labels)
         image = (embedding + dense).flatten(2)[0].T

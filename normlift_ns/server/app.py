@@ -63,7 +63,7 @@ _IDLE_SECONDS = 1.0
 """Seconds without a request after which the server computes data in advance."""
 _QUICK_THREADS = 4
 _THREADS = max(2, torch.get_num_threads() // 2)
-"""Number of threads for queries, and of those for slower work such as explanations. Each thread uses several cores."""
+"""Number of threads for queries, and also for slower work such as explanations. Each thread uses several cores."""
 _HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY, "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin",
@@ -340,7 +340,10 @@ class WarmServer:
         return FileResponse(path, headers=headers)
 
     async def _list_runs(self, request: Request) -> Response:
-        """List the runs that can be opened. One run at a time is held, because all may exceed the memory limit."""
+        """List the runs that can be opened; if there are none, raise the first error.
+
+        The method holds one run at a time, because all runs together may exceed the memory limit.
+        """
         runs, errors = [], []
         for name in self.runs.ids:
             try:
@@ -404,8 +407,13 @@ class WarmServer:
             return None if ended else await _close(websocket, error)
 
     def start(self, extra_routes: Sequence[Any] = (), lifespan: Any = None) -> int:
-        """Start the server in a thread, and return its port: `options.port` or, if it is not available, the next
-        one."""
+        """Start the server in a thread, and return its port: `options.port` or, if it is in use, the next free one.
+
+        For port 0, the operating system chooses a free port.
+
+        Raises:
+            InputError: If neither the port nor one of the 99 ports after it is available.
+        """
         listener = _bind(self.options.host, self.options.port)
         config = uvicorn.Config(
             self.app(extra_routes, lifespan), log_config=None, log_level="error", access_log=False, server_header=False,
@@ -441,7 +449,13 @@ async def _close(websocket: WebSocket, error: BaseException) -> None:
 
 
 def _bind(host: str, port: int) -> socket.socket:
-    """Return a socket that listens on `port` or, if it is in use, on the next free port."""
+    """Return a socket that listens on `port` or, if it is in use, on the next free one of the 99 ports after it.
+
+    For port 0, the operating system chooses a free port.
+
+    Raises:
+        InputError: If none of these ports is available.
+    """
     family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
     for number in [0] if port == 0 else range(port, min(port + 100, 65536)):
         listener = socket.socket(family, kind, protocol)

@@ -210,13 +210,17 @@ class RemoteRun:
 
     @check_arguments
     def coverage(self, min_reliability: float | None = None) -> dict[str, Any]:
-        """Find regions without reliable evidence, and return the content of `Coverage.to_json`."""
+        """Find regions without reliable evidence, and images and poses that would add evidence.
+
+        Returns:
+            The content of `Coverage.to_json`.
+        """
         query = "" if min_reliability is None else f"?min_reliability={min_reliability}"
         return json.loads(self._get(self._path("coverage" + query)))
 
     @check_arguments
     def features(self, start: int = 0, stop: int | None = None) -> Float[Tensor, "m d"]:
-        """Return the unit features of the Gaussians `start` to `stop` - 1 (default: all).
+        """Return the unit features of the Gaussians `start` to `stop` - 1 (default: all), or 0 without a direction.
 
         Raises:
             ValueError: The range is not valid, or has more than 131,072 Gaussians.
@@ -289,7 +293,12 @@ class RemoteRun:
 
     @check_arguments
     def camera(self, view: str | int) -> Camera:
-        """Return the camera of the training image with the name or index `view`."""
+        """Return the camera of the training image with the name or index `view`.
+
+        Raises:
+            ValueError: No image, or more than one image, has this name or index.
+            OSError: The server does not respond.
+        """
         cameras = json.loads(self._get(self._path("cameras")))["cameras"]
         if isinstance(view, int):
             matches = cameras[view : view + 1] if view >= 0 else []

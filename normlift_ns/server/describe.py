@@ -1,4 +1,4 @@
-"""State of a session, Gaussian under the pointer and explanation of a selection, as JSON types for a page."""
+"""The state of a session, the Gaussian under the pointer and the explanation of a selection, as JSON types."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ def floaters(served: ServedRun, query: Any) -> schema.SelectResult | Content:
 
 
 def coverage_of(served: ServedRun, query: Any) -> dict[str, Any]:
-    """Find regions without reliable evidence."""
+    """Find regions without reliable evidence, and images and poses that would add evidence."""
     least = query.get("min_reliability")
     if least is None:
         return coverage(served.run).to_json()
@@ -150,7 +150,11 @@ def coverage_of(served: ServedRun, query: Any) -> dict[str, Any]:
 
 
 def features(served: ServedRun, query: Any) -> Content:
-    """Return the unit features [M, D] of a range of Gaussians as an NPY file."""
+    """Return the unit features [M, D] of a range of Gaussians as an NPY file; Gaussians without a direction have 0.
+
+    Raises:
+        ValueError: The range is empty, exceeds the scene, or has more than `MAX_FEATURES` Gaussians.
+    """
     count = len(served.space)
     start, stop = (int(_number(name, query.get(name, str(end)))) for name, end in (("start", 0), ("stop", count)))
     if not 0 <= start < stop <= count or stop - start > MAX_FEATURES:
@@ -210,8 +214,9 @@ ENDPOINTS = (
              schema.SelectResult, floaters, parameters=("arrays",)),
     Endpoint("coverage", "Find regions without reliable evidence. This takes seconds.", None, dict[str, Any],
              coverage_of, parameters=("min_reliability",)),
-    Endpoint("features", "Return the unit features [M, D] of the Gaussians start to stop - 1 as a float32 NPY file.",
-             None, None, features, parameters=("start", "stop", "refined")),
+    Endpoint("features", "Return the unit features [M, D] of the Gaussians start to stop - 1 as a float32 NPY file. "
+             "Gaussians without a direction have zeros.", None, None, features,
+             parameters=("start", "stop", "refined")),
     Endpoint("inventory", "List up to 20 main objects of the scene, found without prompts. This takes seconds.", None,
              dict[str, Any], inventory),
 )  # fmt: skip

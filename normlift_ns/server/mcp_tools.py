@@ -122,8 +122,8 @@ class Tools:
         object_number: ObjectNumber = None,
         format: Annotated[str, Field(description="ply, or masks for a ZIP file of mask images")] = "ply",
     ) -> str:
-        """Write the Gaussians that match prompts, or one of the matching objects, to a new file in the export folder of
-        the server, and return the file name. Existing files are never replaced."""
+        """Write the Gaussians that match prompts, or one of the matching objects, to a new file, and return its name.
+        The file is in the export folder of the server. Existing files are never replaced."""
         if self._export_dir is None:
             raise InputError("This server does not export files. Start it with --export-dir.")
         request = schema.ExportRequest(_question(prompts), object=object_number, format=format)
@@ -174,7 +174,10 @@ def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
 
 
 def _guarded(server: WarmServer, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a coroutine function that calls `function` in a thread and removes absolute paths from its errors."""
+    """Return a coroutine function that calls `function` in a thread.
+
+    It raises ToolError for every error, with the message without absolute paths.
+    """
 
     @wraps(function)
     async def run(**arguments: Any) -> Any:

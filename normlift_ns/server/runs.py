@@ -289,13 +289,19 @@ class ServedRun:
         """
         view = view or self.first_view
         if view is None:
-            raise InputError("The camera of the page is not known yet. Move the camera, and try again.")
+            raise InputError(
+                "No camera is known, and the run has no training images. Move the camera of the page, and try again."
+            )
         scene = self.run.scene.gaussians
         position = unoccluded_viewpoint(target, scene, drawn, view.position, view.up, view.fov)
         return msgspec.structs.replace(view, position=position, look_at=tuple(target.center))
 
     def image(self, index: int, max_size: int) -> bytes:
-        """Return a training image as JPEG, with at most `max_size` pixels along its longer side."""
+        """Return a training image as JPEG, with at most `max_size` pixels along its longer side.
+
+        Raises:
+            ValueError: The run has no image with this index.
+        """
         if not 0 <= index < len(self.run.scene.train):
             raise InputError(
                 f"The run has no image {index}. It has {len(self.run.scene.train)} images, numbered from 0."
@@ -412,7 +418,7 @@ class RunStore:
         """Return the run with the id `name`, and open it if necessary.
 
         Raises:
-            ValueError: No run has this id, or the run cannot be opened.
+            ValueError, FileNotFoundError: No run has this id, or the run cannot be opened.
         """
         if name not in self._configs:
             raise InputError(f"The server has no run {name!r}. Choose one of: {', '.join(self.ids)}.")

@@ -160,7 +160,12 @@ class PageSession:
         return self._memory.history.now
 
     async def run(self) -> None:
-        """Serve the page until its connection ends."""
+        """Serve the page until its connection ends.
+
+        Raises:
+            ValueError: The first message is not a greeting.
+            TimeoutError: The first message does not arrive in time.
+        """
         with anyio.fail_after(_GREETING_TIMEOUT):
             first = protocol.read_message(await self._socket.receive_text())
         if first.action != "greet":
@@ -520,7 +525,9 @@ class PageSession:
             try:
                 view = self._memory.view or self._run.first_view
                 if view is None:
-                    raise InputError("The camera of the page is not known yet. Move the camera, and try again.")
+                    raise InputError(
+                        "No camera is known, and the run has no training images. Move the camera, and try again."
+                    )
                 camera = view.camera(pending.value.max_size)
                 draw = partial(self._still, state, camera, pending.value.background)
                 jpeg = await self._in_thread(draw, self._limits.slow)

@@ -172,6 +172,8 @@ def test_wrong_label_files_say_what_is_wrong(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no picture")
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/a.jpg"), "a.png", "not an image")
     refused(lambda: LabelFiles(tmp_path / "nowhere"), "nowhere", "--regions-dir", error=FileNotFoundError)
+    (tmp_path / "a.txt").touch()
+    refused(lambda: LabelFiles(tmp_path / "a.txt"), "a.txt is not a folder", "--regions-dir", error=FileNotFoundError)
     parts = ("images/b.jpg", "b.png or b.npy")
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, "images/b.jpg"), *parts, error=FileNotFoundError)
     np.save(tmp_path / "a.npy", MAP)
