@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -13,7 +13,6 @@ from tests.browser.page import OnPage
 from tests.browser.person import chromium
 from tests.browser.server import OWN, STOCK, Server, copied, faults
 from tests.browser.viewer import Tab
-from tests.captures import SHARED
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -37,24 +36,6 @@ def servers(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     for server in made.values():
         server.stop()
         assert faults(server.said()) == []
-
-
-@pytest.fixture(scope="session")
-def colored(nerfstudio: Any, made_once: Any) -> Callable[[str], Path]:
-    """config.yml of a capture by its name, lifted from colors of six small images; tests must not change the run."""
-    from normlift_ns.cli.lift import NormLift  # noqa: PLC0415
-    from normlift_ns.options import LiftOptions, SourceOptions  # noqa: PLC0415
-
-    def lift(name: str) -> Path:
-        source = SHARED / "captures" / "outputs" / name / "splatfacto" / "run" / "config.yml"
-        options, color = LiftOptions(max_views=6, lift_downscale=4), SourceOptions(encoder="color")
-
-        def make(folder: Path) -> None:
-            NormLift(source, source=color, lift=options, check_alignment=False, output_dir=folder).main()
-
-        return next(made_once(f"colored-{name}", make).glob("*/normlift/*/config.yml"))
-
-    return lift
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -164,12 +163,6 @@ class OnPage(Person):
 
         self.until(holds, what)
         return shots[-1]
-
-    def save(self, element: str, folder: Path) -> Path:
-        with self.page.expect_download() as waiting:
-            self.does(element)
-        waiting.value.save_as(folder / waiting.value.suggested_filename)
-        return folder / waiting.value.suggested_filename
 
     def toast(self) -> tuple[str, dict[str, float]]:
         toast = self.page.locator(".toast").last

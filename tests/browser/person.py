@@ -203,9 +203,9 @@ class Person:
         self.press(button)
         self.says(ARMED)
 
-    def save(self, button: str, folder: Path) -> Path:
+    def save(self, press: Callable[[], object], folder: Path) -> Path:
         with self.page.expect_download() as waiting:
-            self.press(button)
+            press()
         waiting.value.save_as(folder / waiting.value.suggested_filename)
         return folder / waiting.value.suggested_filename
 
@@ -266,14 +266,6 @@ class Person:
 
     def click(self, place: tuple[float, float]) -> None:
         self.page.mouse.click(place[0], self.top + place[1])
-
-    def drag(self, x: float, y: float, button: Any = "left") -> None:
-        """Drags from the middle of the picture: turns the camera, with the right button moves it."""
-        middle = ((self.size[0] - PANEL) / 2, (self.top + self.size[1]) / 2)
-        self.page.mouse.move(*middle)
-        self.page.mouse.down(button=button)
-        self.page.mouse.move(middle[0] + x, middle[1] + y, steps=8)
-        self.page.mouse.up(button=button)
 
 
 def hue_mask(picture: np.ndarray, hue: float, saturation: float) -> np.ndarray:

@@ -64,10 +64,8 @@ def test_a_person_asks(page: OnPage) -> None:
     assert chips[0].startswith("red") and "not understood" in chips[1] and chips[2].startswith("yellow")
     assert all(0 < float(re.findall(r"\d\.\d\d", chips[i])[0]) <= 1 for i in (0, 2))
     seen = page.sees(lambda seen: covers(seen, red | yellow), "an overlay of both")
-    swatches = page.page.locator(".swatch").evaluate_all(
-        "all => all.map((one) => getComputedStyle(one).backgroundColor)"
-    )
-    for swatch, where in zip(swatches, (red, yellow)):  # one scheme of colors
+    colors = "all => all.map((one) => getComputedStyle(one).backgroundColor)"
+    for swatch, where in zip(page.page.locator(".swatch").evaluate_all(colors), (red, yellow)):  # one scheme of colors
         rgb = np.array(re.findall(r"\d+", swatch)[:3], dtype=float)
         drawn = np.median(seen[where], axis=0)
         assert np.corrcoef(rgb, drawn)[0, 1] > 0.9
@@ -78,6 +76,9 @@ def test_a_person_asks(page: OnPage) -> None:
     page.until(lambda: page.page.locator(".histogram").count() == 2, "two histograms")
     fewer = page.changes(lambda: page.page.locator("#threshold").press("End"), "a higher threshold")
     assert fewer < both
+    page.changes(lambda: page.does("do-suggested"), "the suggested threshold")
+    page.page.keyboard.press("Control+z")
+    page.selects(lambda count: count == fewer, "undone")
     page.page.keyboard.press("Control+z")
     page.selects(lambda count: count == both, "undone")
 
@@ -190,21 +191,19 @@ def test_a_person_looks_around_explains_and_exports(page: OnPage, own: Server, t
 
     page.does("do-why")
     page.until(lambda: page.page.locator("#why img").count() >= 3, "images")
-    page.until(
-        lambda: page.page.evaluate("[...document.querySelectorAll('#why img')].every((one) => one.naturalWidth)"),
-        "drawn",
-    )
+    drawn = "[...document.querySelectorAll('#why img')].every((one) => one.naturalWidth)"
+    page.until(lambda: page.page.evaluate(drawn), "drawn")
     assert re.search(r"Based on about \d+ images", page.page.locator("#why").inner_text())
     assert page.page.locator("#stage").bounding_box()["height"] > 200  # type: ignore[index]  # beside the scene
     page.page.keyboard.press("Escape")
     page.until(lambda: page.page.locator("#why").is_hidden(), "closed")
 
-    vertices = PlyData.read(page.save("save-ply", tmp_path), mmap=False)["vertex"]
+    vertices = PlyData.read(page.save(lambda: page.does("save-ply"), tmp_path), mmap=False)["vertex"]
     assert 0 < vertices.count <= some
     text, box = page.toast()
     button = page.page.locator("#save-ply").bounding_box()
     assert "Downloaded" in text and button is not None and abs(box["y"] - button["y"]) < 150  # near what was pressed
-    picture = Image.open(page.save("do-screenshot", tmp_path))
+    picture = Image.open(page.save(lambda: page.does("do-screenshot"), tmp_path))
     assert picture.format == "PNG" and picture.width >= 600
 
     page.sees(lambda seen: covers(seen, red), "the start view")
@@ -386,7 +385,7 @@ def test_a_person_asks_clicks_saves_and_outlives_the_server(tab: Tab, stock: Ser
     tab.sees(lambda seen: overlaid(seen).sum() < 0.8 * overlaid(near).sum(), "hidden")
     tab.press("Undo")
     tab.until(lambda: HIDDEN not in tab.text(), "undone")
-    assert tab.save("Export", tmp_path).name == "red_1.ply"
+    assert tab.save(lambda: tab.press("Export"), tmp_path).name == "red_1.ply"
     tab.press("Why?")
     tab.until(lambda: tab.images("jpeg") >= 3, "photographs")
     panel = tab.page.locator("[role=tabpanel]:visible").bounding_box()
@@ -404,7 +403,7 @@ def test_a_person_asks_clicks_saves_and_outlives_the_server(tab: Tab, stock: Ser
     tab.click(middle(yellow))
     clicked = tab.selects(lambda count: count not in (0, some), "clicked")
     name = tab.typed("Prompts")
-    vertices = PlyData.read(tab.save("Download selection", tmp_path), mmap=False)["vertex"]
+    vertices = PlyData.read(tab.save(lambda: tab.press("Download selection"), tmp_path), mmap=False)["vertex"]
     assert 0.8 * clicked < vertices.count <= clicked
     tab.press("Save prompts in run")
     tab.until(lambda: len(load_query(stock.config.parent / "normlift").texts) == 3, "saved")  # type: ignore[union-attr]

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import shutil
 from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import yaml
 from PIL import Image
 
 from normlift_ns import evidence_collection, open_run, open_scene
@@ -22,7 +22,7 @@ from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.query.question import load_query
 from normlift_ns.segmentation.sam import MaskRules, SamMasks
 from tests.cli.conftest import QUICK, SMALL, run_entry, said
-from tests.data.scene_files import ply_columns, random_splat, write_gsplat, write_ply
+from tests.data.scene_files import ply_columns, write_ply
 
 TWO = ("--max-views", "2", "--refine", "False")
 
@@ -50,8 +50,9 @@ def test_lifting_writes_a_run_that_finds_the_colours(lifted: Path, room: DemoRoo
 def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch, capsys):
     outputs = ("--output-json", tmp_path / "a.json", "--output-npz", tmp_path / "a.npz")
     outputs += ("--render-dir", tmp_path / "pictures")
-    flags = ("--load-config", lifted, "--text", "red", "sky blue", *outputs, "--render-views", "0003", "0007")
-    assert run_entry(monkeypatch, query.entrypoint, *flags) == 0
+    flags = ("--load-config", lifted, *outputs, "--render-views", "0003", "0007", "--text", "red", "sky blue")
+    for overwrite in ("False", "True"):
+        assert run_entry(monkeypatch, query.entrypoint, *flags, "--overwrite", overwrite) == 0
     shown = capsys.readouterr().out
     assert "sky blue" in shown and "reliability" in shown and str(tmp_path / "pictures") in shown
     document = json.loads((tmp_path / "a.json").read_text())
@@ -75,34 +76,27 @@ def test_querying_prints_a_table_and_writes_files(lifted, tmp_path, monkeypatch,
     for path in pictures:
         pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
         assert (np.ptp(pixels, axis=2) > 60).mean() > 0.001, path  # something is coloured, over a grey image
+    unknown = ("--text", "red", "--render-views", "9999", "--render-dir", tmp_path / "new", "--output-json")
+    assert run_entry(monkeypatch, query.entrypoint, *flags[:2], *unknown, tmp_path / "b.json") == 1
+    shown = said(capsys)
+    assert all(word in shown for word in ("'9999'", "12", "'0000'", "'0011'"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "a.npz", "pictures"]
 
 
-def test_a_query_replaces_nothing_unasked(lifted, tmp_path, monkeypatch, capsys):
-    for output in ("--objects-dir", "--output-json", "--output-npz", "--render-dir"):
-        folder = tmp_path / output
-        folder.mkdir()
-        pictures, objects = output == "--render-dir", output == "--objects-dir"
-        existing = folder / ("0003_1_sky_blue.png" if pictures else "objects.json" if objects else "mine")
-        existing.write_text("mine")
-        place = folder if objects or pictures else existing
-        flags = ("--load-config", lifted, "--text", "red", "sky blue", output, place, *["--objects"] * objects)
-        with monkeypatch.context() as patch:
-            patch.setattr("normlift_ns.query.arrays.open_quick", None)  # refused before anything is opened
-            for views in ((), ("--render-views", "0002", "images/0003.png") if pictures else ()):
-                assert run_entry(patch, query.entrypoint, *flags, *views) == 1
-                shown = said(capsys)
-                assert f"{existing.name} exists" in shown and output in shown and "--overwrite True" in shown
-        assert [path.read_text() for path in folder.iterdir()] == ["mine"]
-        views = ("--render-views", "0003") if pictures else ()
-        assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 1
-        assert "contains text" in said(capsys) and existing.read_text() == "mine"
-        existing.write_text("")
-        assert run_entry(monkeypatch, query.entrypoint, *flags, *views, "--overwrite", True) == 0
-        assert existing.stat().st_size > 100
-        assert len(list(folder.iterdir())) == (2 if pictures else 4 if objects else 1)
-    named = ("--load-config", lifted, "--text", "yellow", "--render-dir", folder, "--render-views", "0003")
-    assert run_entry(monkeypatch, query.entrypoint, *named) == 0  # of another text
-    assert {path.name for path in folder.iterdir()} == {"0003_0_red.png", "0003_1_sky_blue.png", "0003_0_yellow.png"}
+def test_queries_are_stored_and_replaced(lifted, tmp_path, monkeypatch) -> None:
+    copy = tmp_path / "outputs" / "room" / "normlift" / "one" / "config.yml"
+    shutil.copytree(lifted.parent, copy.parent)
+    flags = ("--load-config", copy, "--data", lifted.parents[4] / "room", "--save-query", "True")
+    rule = ("--threshold", "0.7", "--min-reliability", "0.25", "--refined", "False")
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "teal", "pink", "orange", *rule) == 0
+    stored = load_query(copy.parent / "normlift")
+    assert stored is not None and stored.texts == ("teal", "pink", "orange")
+    assert (stored.threshold, stored.min_reliability, stored.refined) == (0.7, 0.25, False)
+    before = (copy.parent / "normlift" / "queries.safetensors").read_bytes()
+    assert run_entry(monkeypatch, query.entrypoint, *flags, "--text", "oragne") == 1
+    assert (copy.parent / "normlift" / "queries.safetensors").read_bytes() == before
+    assert run_entry(monkeypatch, query.entrypoint, *flags[:-2], "--text", "red") == 0
+    assert (copy.parent / "normlift" / "queries.safetensors").read_bytes() == before
 
 
 def test_lifts_without_a_name_at_the_same_second_both_remain(little, tmp_path, monkeypatch):
@@ -196,27 +190,10 @@ def test_fewer_smaller_and_rendered_views(little, tmp_path, monkeypatch):
     assert found["views"] == 5 and 0 < found["zero_evidence_share"] < 0.5
 
 
-def test_pictures_of_an_unknown_view_are_refused(lifted, tmp_path, monkeypatch, capsys):
-    flags = ("--load-config", lifted, "--text", "red", "--render-views", "9999", "--output-json", tmp_path / "a.json")
-    assert run_entry(monkeypatch, query.entrypoint, *flags, "--render-dir", tmp_path / "pictures") == 1
-    shown = said(capsys)
-    assert "'9999'" in shown and "12" in shown and "'0000'" in shown and "'0011'" in shown
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.slow
 def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tmp_path, monkeypatch):
     """Export, then import with text vectors from a file: nothing is rasterized, every number is the same."""
-    output = (
-        "--load-config",
-        little,
-        "--vote-k",
-        "12",
-        "--consensus-min-agreement",
-        "0.4",
-        "--output-dir",
-        tmp_path / "out",
-    )
+    output = ("--load-config", little, "--vote-k", 12, "--consensus-min-agreement", 0.4, "--output-dir", tmp_path)
     exporting = ("--encoder", "color", "--export-langsplat", tmp_path / "features", "--timestamp", "ours")
     assert run_entry(monkeypatch, lift.entrypoint, *output, *exporting) == 0
     assert len(list((tmp_path / "features").iterdir())) == 2 * 6
@@ -228,7 +205,7 @@ def test_features_written_in_langsplats_format_lift_to_the_same_field(little, tm
     vectors = ("--text-embeddings", tmp_path / "texts.npz")
     flags = (*output, *importing, *vectors, "--timestamp", "theirs", "--queries", "red")
     assert run_entry(monkeypatch, lift.entrypoint, *flags) == 0
-    first, second = (field_of(tmp_path / "out", name) for name in ("ours", "theirs"))
+    first, second = (field_of(tmp_path, name) for name in ("ours", "theirs"))
     for name in ("norm", "c_intra", "c_inter", "n_eff", "reliability", "weight"):
         assert torch.equal(getattr(first.scalars, name), getattr(second.scalars, name)), name
     assert torch.equal(first.source, second.source)
@@ -251,14 +228,16 @@ def test_double_precision_differs_from_the_default_by_rounding(little, tmp_path,
     assert (double.source != single.source).float().mean() < 0.01
 
 
-@pytest.fixture
-def ply(little: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return write_ply(tmp_path / "scene.ply", ply_columns(SplatParameters(**open_scene(little).parameters)))
-
-
-def test_a_splat_of_no_run_is_lifted_asked_exported_and_evaluated(ply, little, tmp_path, monkeypatch, capsys) -> None:
+def test_a_splat_of_no_run_is_lifted_asked_exported_evaluated_and_drawn(
+    nerfstudio, little, tmp_path, monkeypatch, capsys
+) -> None:
     """The config names cameras that nerfstudio leaves as they are."""
+    from nerfstudio.scripts.render import DatasetRender  # noqa: PLC0415
+
+    from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
+
+    monkeypatch.chdir(tmp_path)
+    ply = write_ply(tmp_path / "scene.ply", ply_columns(SplatParameters(**open_scene(little).parameters)))
     room, world = little.parents[4] / "room", little.parent / "dataparser_transforms.json"
     cameras = ("--transforms", room / "transforms.json", "--world-transform", world)
     flags = ("--load-ply", ply, *cameras, *SMALL, "--timestamp", "a", "--queries", "red", "yellow")
@@ -274,33 +253,11 @@ def test_a_splat_of_no_run_is_lifted_asked_exported_and_evaluated(ply, little, t
     flags = ("--protocol", "masks", "--labels", room / "instance", "--output-path", tmp_path / "scores.json")
     assert run_entry(monkeypatch, evaluate.entrypoint, *asked, *flags) == 0
     assert json.loads((tmp_path / "scores.json").read_text())
-    config = yaml.unsafe_load((run_dir / "config.yml").read_text())
-    parser = config.pipeline.datamanager.dataparser
-    assert (parser.orientation_method, parser.center_method, parser.eval_mode) == ("none", "none", "all")
-    assert (parser.auto_scale_poses, parser.load_3D_points, parser.downscale_factor) == (False, False, 1)
-    assert parser.data == config.data == run_dir / "transforms.json"
-    frame = json.loads((run_dir / "transforms.json").read_text())["frames"][0]
-    assert Path(frame["file_path"]).is_absolute()
-    assert {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2"} < set(frame)
-
-
-@pytest.mark.slow
-def test_what_does_not_fit_is_one_message_unless_it_is_asked_for(ply: Path, little: Path, monkeypatch, capsys) -> None:
-    columns, splat = ply_columns(random_splat(5)), ply_columns(SplatParameters(**open_scene(little).parameters))
-    write_ply(ply.parent / "points.ply", {name: columns[name] for name in "xyz"})
-    write_gsplat(ply.parent / "other.pt", random_splat(50))
-    write_ply(ply.parent / "far.ply", {**splat, "z": splat["z"] + 1000})
-    write_ply(ply.parent / "bent.ply", {**splat, "x": 2 * splat["x"]})  # in no world
-    given = ("--transforms", little.parents[4] / "room", *SMALL, "--timestamp", "a", "--max-views", "2")
-    for kind, name, *facts in (
-        ("ply", "points.ply", "not a splat", "f_dc_0"),
-        ("gsplat", "other.pt", "normalized"),
-        ("ply", "bent.ply", "dB", "--world-transform"),
-        ("ply", "far.ply", "do not show this splat"),
-    ):
-        assert run_entry(monkeypatch, lift.entrypoint, f"--load-{kind}", name, *given) == 1, name
-        text = said(capsys).replace("│", " ")
-        assert [fact for fact in facts if fact not in text] == [] and "Traceback" not in text, text
-        assert not (ply.parent / "outputs").exists()
-    assert run_entry(monkeypatch, lift.entrypoint, "--load-ply", ply, *given, "--check-alignment", "False") == 0
-    assert (ply.parent / "outputs" / "room" / "normlift" / "a" / "config.yml").is_file()
+    ply.unlink()  # the run does not need it
+    monkeypatch.chdir("/")
+    monkeypatch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
+    how: Any = {"rendered_output_names": ["rgb", "relevancy_0"], "split": "test", "image_format": "png"}
+    DatasetRender(asked[1], output_path=tmp_path, **how).main()
+    files = (tmp_path / "test" / "rgb" / "0006.png", room / "images" / "0006.png")
+    drawn, photo = (np.asarray(Image.open(file).convert("RGB")).astype(float) for file in files)
+    assert np.abs(drawn - photo).mean() < 3

@@ -14,9 +14,7 @@ from pathlib import Path
 import pytest
 
 from normlift_ns.cli import common
-from normlift_ns.cli.batch import _parse
-from normlift_ns.cli.evaluate import NormLiftEval
-from normlift_ns.errors import InputError, describe_error
+from normlift_ns.errors import describe_error
 from normlift_ns.io import memory
 from normlift_ns.io.atomic import atomic_file, deferred_signals
 from research.reference import COMMANDS
@@ -137,13 +135,3 @@ def test_a_lift_that_cannot_fit_is_refused_with_the_estimate(monkeypatch):
     for error in (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), MemoryError(),
                   RuntimeError("can't start new thread")):  # fmt: skip
         assert describe_error(error)[1] == 1 and "memory is full" in describe_error(error)[0]
-
-
-def test_options_without_effect_are_refused():
-    with pytest.raises(InputError, match="ns-normlift --help"):
-        _parse(["--load-config", "a", "--help"])
-    for protocol in ("masks", "none", "scannet"):
-        words = ["--protocol", protocol, "--margin", "0.5", "--load-config", "a", "--labels", "b"]
-        command = common.parse_flags(NormLiftEval, words, "x")
-        with pytest.raises(InputError, match="--margin is an option of --protocol lerf"):
-            command._check()

@@ -74,23 +74,6 @@ def test_properties_are_those_of_the_field(scene_ply: Path, lifted: Path) -> Non
     assert (run.scene.gaussians.opacities[rows] > 0.0039).all()
 
 
-def test_readers_of_other_programs_open_it(scene_ply: Path) -> None:
-    """trimesh, open3d, and the way in which the code of 3D Gaussian splatting picks properties by their prefix."""
-    import trimesh  # noqa: PLC0415
-
-    count = len(np.load(scene_ply.with_name("splat_rows.npy")))
-    assert trimesh.load(scene_ply).vertices.shape == (count, 3)
-    ply = PlyData.read(scene_ply)
-    names = [p.name for p in ply.elements[0].properties]
-    assert ply.header.startswith("ply\nformat binary_little_endian 1.0\n")
-    for prefix, number in (("f_rest_", 45), ("f_dc_", 3), ("scale_", 3), ("rot", 4), ("opacity", 1)):
-        assert len([n for n in names if n.startswith(prefix)]) == number
-    open3d = pytest.importorskip("open3d", reason="open3d needs system libraries here", exc_type=ImportError)
-    cloud = open3d.t.io.read_point_cloud(str(scene_ply))
-    assert cloud.point.positions.shape[0] == count
-    assert cloud.point.reliability.numpy().max() < 1
-
-
 @pytest.mark.slow
 def test_selection_and_rest_are_the_scene_and_clean_lacks_floaters(scene_ply, lifted, tmp_path, monkeypatch, capsys):
     rows, whole = {}, np.load(scene_ply.with_name("splat_rows.npy"))
@@ -111,19 +94,9 @@ def test_selection_and_rest_are_the_scene_and_clean_lacks_floaters(scene_ply, li
     assert np.array_equal(np.load(tmp_path / "clean_rows.npy"), whole)
 
 
-def test_mistakes_have_a_message_and_an_export_stays_in_its_folder(lifted, tmp_path, monkeypatch, capsys) -> None:
+def test_mistakes_have_a_message_and_leave_nothing(lifted, tmp_path, monkeypatch, capsys) -> None:
     given = ("--load-config", lifted, "--output-dir", tmp_path / "x", "--text")
-    for flags, fact in (
-        (("red", "--threshold", "1.5", "--select", "selection"), "no Gaussian"),
-        (("oragne",), "orange"),
-        *(
-            (("red", "--output-filename", name), "--output-filename")
-            for name in ("../a.ply", tmp_path / "a", "..", "b/a")
-        ),
-        (("red", "--transfer-distance", 3), "--transfer FILE"),
-        (("red", "--floater-threshold", 2), "--select clean"),
-        (("--threshold", 0.5), "--text"),
-    ):
+    for flags, fact in ((("red", "--threshold", 1.5, "--select", "selection"), "no Gaussian"), (("oragne",), "orange")):
         assert run_entry(monkeypatch, export.entrypoint, *given, *flags) == 1
         assert fact in said(capsys)
         assert list(tmp_path.rglob("*.*")) == []
@@ -171,7 +144,7 @@ def test_one_option_puts_tables_and_files_into_the_coordinates_of_the_capture(li
 
 def test_masks_arrays_and_labels_of_a_cloud(scene_ply, lifted, room, tmp_path, monkeypatch, capsys) -> None:
     run = open_run(lifted)
-    answer, means = run.ask("red", "yellow"), run.scene.gaussians.means
+    means = run.scene.gaussians.means
     points = np.concatenate([run.to_capture.transform_points(means[:50].double().numpy()), [[1e6, 0, 0]]])
     table = np.array([tuple(point) for point in points], [(axis, "f8") for axis in "xyz"])
     PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "cloud.ply"))
@@ -203,7 +176,6 @@ def test_masks_arrays_and_labels_of_a_cloud(scene_ply, lifted, room, tmp_path, m
     rest = ("--select", "rest", "--masks-dir", tmp_path / "rest", "--output-filename", "rest.ply")
     assert run_entry(monkeypatch, export.entrypoint, *flags[:4], *rest) == 0
     assert np.array_equal(np.array(Image.open(tmp_path / "rest" / "0003.png")), 255 - found)
-    assert answer.mask.any()
     again = ("--masks-dir", tmp_path / "masks", "--output-dir", tmp_path / "again")
     assert run_entry(monkeypatch, export.entrypoint, *flags[:2], *again) == 1
     assert "--masks-dir, or --overwrite True" in said(capsys)

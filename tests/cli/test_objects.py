@@ -2,7 +2,6 @@
 
 import csv
 import json
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from normlift_ns import Camera, InputError, LiftOptions, SourceOptions, lift_run, open_run
-from normlift_ns.analysis.objects import csv_columns, view_shares
+from normlift_ns.analysis.objects import view_shares
 from normlift_ns.cli import query
 from normlift_ns.cli.query import print_catalog
 from normlift_ns.demo.room import DemoRoom
@@ -129,12 +128,6 @@ def test_views_are_those_that_show_it(lifted: Path) -> None:
     for wrong in (0.0, -1.0, float("nan")):
         with pytest.raises(InputError, match="meters_per_unit"):
             run.catalogue(answer, meters_per_unit=wrong)
-
-
-def test_the_page_explains_every_column() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "objects.md").read_text("utf8")
-    explained = set(re.findall(r"`([a-z0-9_]+)`", page))
-    assert set(csv_columns()) <= explained | {f"scene_{name}" for name in explained}
 
 
 def test_why_is_a_table_json_and_pictures(lifted: Path, tmp_path: Path, monkeypatch, capsys) -> None:

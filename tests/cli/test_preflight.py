@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -23,6 +24,7 @@ pipeline: !!python/object:a.B
 """
 
 
+MY_ANSWERS = ("answers.json", "scores.npz", "objects.json", "0003_1_sky_blue.png")
 MY_EXPORTS = ("a.ply", "b_rows.npy", "c_names.json", "d_objects.json")
 MY_SCORES = ("e.json", "f_sweeps.svg", "g_signals.svg", "h_coverage_camera_path.json", "i_coverage_pose_5.png")
 
@@ -42,7 +44,7 @@ def config(tmp_path: Path) -> Path:
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "outputs" / "room" / "normlift" / "old").mkdir(parents=True)
     (tmp_path / "mine").mkdir()
-    for name in (*MY_EXPORTS, *MY_SCORES):
+    for name in (*MY_ANSWERS, *MY_EXPORTS, *MY_SCORES):
         (tmp_path / "mine" / name).touch()
     return folder / "config.yml"
 
@@ -106,6 +108,10 @@ QUERY = [
     ("--text a --min-reliability nan", "--min-reliability must be in 0..1, got nan"),
     ("--text a --output-json room", "room exists", "--output-json"),
     ("--text a --output-json room --overwrite True", "room, given with --output-json", "room"),
+    ("--text a --output-json mine/answers.json", "answers.json exists", "--output-json", "--overwrite True"),
+    ("--text a --output-npz mine/scores.npz", "scores.npz exists", "--output-npz", "--overwrite True"),
+    ("--text a --objects --objects-dir mine", "objects.json exists", "--objects-dir", "--overwrite True"),
+    (("--text", "a", "sky blue", "--render-dir", "mine"), "sky_blue.png exists", "--render-dir", "--overwrite True"),
     ("--text a --output-json file/x", "--output-json is"),
     ("--text a --output-json n --render-dir n/b", "n/b", "folder and as a file"),
     ("--text a --output-json n --output-npz n", "--output-json and --output-npz", ", n"),
@@ -129,6 +135,11 @@ QUERY = [
     ("--text red --image a.png", "--inventory"),
     ("--inventory --vocabulary none.txt", "does not exist"),
     ("--inventory --save-query", "--save-query"),
+    ("--text a --log-file .", ".", "not a regular file"),
+    ("--text a --log-file nowhere/a.log", "nowhere/a.log, given with --log-file", "No such file"),
+    ("--text a --log-file", "--log-file"),
+    ("--log-file --text a", "--log-file"),
+    ("--text a --quiet yes", "--quiet must be True or False, got 'yes'"),
 ]
 EXPORT = [
     ("--select selection", "--select selection", "--text"),
@@ -141,6 +152,10 @@ EXPORT = [
     ("--output-filename /", "--output-filename"),
     ("--text a --transfer none.ply", "none.ply, given with --transfer"),
     ("--text a --select clean --masks-dir m", "--masks-dir"),
+    *((f"--text a --output-filename {name}", "--output-filename") for name in ("../a.ply", "..", "b/a")),
+    ("--text a --transfer-distance 3", "--transfer FILE"),
+    ("--text a --floater-threshold 2", "--select clean"),
+    ("--threshold 0.5", "--text"),
 ]
 STUDIES = "--protocol masks --labels room --study sweeps signals coverage --output-path mine"
 EVAL = [
@@ -154,6 +169,8 @@ EVAL = [
     ("--protocol masks --labels room room", "got 1 and 2", "--labels"),
     ("--protocol none", "protocol none", "--labels", "--study coverage"),
     ("--protocol none --study coverage --labels .", "protocol none", "--study coverage"),
+    ("--protocol none --study coverage --margin 0.5", "--margin is an option of --protocol lerf"),
+    ("--protocol scannet --labels room --margin 0.5", "--margin is an option of --protocol lerf"),
 ]
 VIEW = [
     ("--port 70000", "--port", "65,535", "70000"),
@@ -163,10 +180,7 @@ VIEW = [
     (f"--host {'a' * 70}", f"--host {'a' * 70}"),
     ("--text-embeddings none.npz", "none.npz, given with --text-embeddings"),
 ]
-SERVE = [
-    ("", "No run is given", "ns-normlift-serve RUN/config.yml"),
-    ("nowhere/config.yml", "nowhere/config.yml"),
-]
+SERVE = [("", "No run is given", "ns-normlift-serve RUN/config.yml"), ("nowhere/config.yml", "nowhere/config.yml")]
 
 
 @pytest.mark.parametrize(
@@ -221,21 +235,14 @@ def test_a_cache_that_is_a_file_or_a_locked_folder_is_refused_early(config, tmp_
 
 
 def test_weights_that_cannot_be_had_are_refused_early(config, monkeypatch, capsys):
-    def unreachable(request: object, timeout: float) -> None:
-        raise OSError("no route")
-
-    monkeypatch.setattr("urllib.request.urlopen", unreachable)
+    monkeypatch.setattr("urllib.request.urlopen", Mock(side_effect=OSError("no route")))
     monkeypatch.setenv("HF_ENDPOINT", "https://hub")
     for there in (False, True, None):
-        asked: list[tuple[str, ...]] = []
-
-        def at_hand(*name: str, asked: list[tuple[str, ...]] = asked, there: bool | None = there) -> bool | None:
-            asked.append(name)
-            return there
-
+        at_hand = Mock(return_value=there)
         monkeypatch.setattr(open_clip, "has_local_clip_weights", at_hand, raising=False)
         code = run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *CLIP, "--timestamp", "old")
-        assert (code, asked) == (1, [("ViT-B-16", "laion2b_s34b_b88k")])
+        at_hand.assert_called_once_with("ViT-B-16", "laion2b_s34b_b88k")
+        assert code == 1
         text = said(capsys)
         assert ("laion2b_s34b_b88k" in text and "https://hub cannot be reached" in text) == (there is False)
 

@@ -12,6 +12,7 @@ import pytest
 
 from normlift_ns.cli import common, evaluate, export, lift, query, view
 from normlift_ns.errors import InputError
+from normlift_ns.server.app import WarmServer
 from tests.cli.conftest import SMALL, run_entry
 
 
@@ -52,29 +53,6 @@ def test_a_log_file_gets_everything_without_colours_and_is_added_to(ended, tmp_p
     assert f"--word no --log-file {log}" in text
 
 
-def test_mistakes_are_messages(ended) -> None:
-    for flags, *facts in (
-        (("--log-file", "."), ".", "not a regular file"),
-        (("--log-file", "nowhere/a.log"), "nowhere/a.log, given with --log-file", "No such file"),
-        (("--log-file",), "--log-file"),
-        (("--log-file", "--word"), "--log-file"),
-        (("--quiet", "yes"), "--quiet must be True or False, got 'yes'"),
-    ):
-        code, out, err = ended(common.info, *flags)
-        assert (code, out) == (1, "") and "Traceback" not in err
-        assert [fact for fact in facts if fact not in err] == [], flags
-
-
-def test_pipes_have_no_colours(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setenv("TERM", "xterm")
-    for name in ("FORCE_COLOR", "NO_COLOR"):
-        monkeypatch.delenv(name, raising=False)
-    for code, *flags in ((0, "--help"), (1, "--load-config", tmp_path / "no.yml"), (1, "--wrod")):
-        assert run_entry(monkeypatch, lift.entrypoint, *flags) == code
-        shown = capsys.readouterr()
-        assert len(shown.out + shown.err) > 20 and "\x1b" not in shown.out + shown.err
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
 @pytest.mark.parametrize("no_color", [True, False])
@@ -84,22 +62,18 @@ def test_a_terminal_has_colours_unless_it_is_told_otherwise(no_color: bool, tmp_
     environment = {name: value for name, value in os.environ.items() if name not in ("FORCE_COLOR", "NO_COLOR")}
     environment |= {"TERM": "xterm-256color"} | ({"NO_COLOR": "1"} if no_color else {})
     program = "from normlift_ns.cli.start import lift; lift()"
-    config = tmp_path / ("long-" * 30) / "no.yml"
-    for flags, fact in (
-        (("--load-config", str(config)), str(config)),
-        (("--vote-k", "many"), "--vote-k cannot be 'many'."),
-    ):
-        master, slave = pty.openpty()
-        words = [sys.executable, "-c", program, *flags]
-        subprocess.run(words, stdout=slave, stderr=slave, env=environment, check=False, timeout=60)
-        os.close(slave)
-        shown = os.read(master, 10**5).decode().replace("\r\n", "\n")
-        os.close(master)
-        assert ("\x1b[" in shown.replace("\x1b[0m", "").replace("\x1b[1m", "")) != no_color
-        lines = shown.splitlines()
-        assert lines[0].endswith("Error\x1b[0m") or lines[0] == "Error"
-        assert fact in re.sub(r"\x1b\[[\d;]*m", "", lines[1])  # one line, at the left, however long
-        assert not set("│╭╰") & set(shown)
+    config = str(tmp_path / ("long-" * 30) / "no.yml")
+    master, slave = pty.openpty()
+    words = [sys.executable, "-c", program, "--load-config", config]
+    subprocess.run(words, stdout=slave, stderr=slave, env=environment, check=False, timeout=60)
+    os.close(slave)
+    shown = os.read(master, 10**5).decode().replace("\r\n", "\n")
+    os.close(master)
+    assert ("\x1b[" in shown.replace("\x1b[0m", "").replace("\x1b[1m", "")) != no_color
+    lines = shown.splitlines()
+    assert lines[0].endswith("Error\x1b[0m") or lines[0] == "Error"
+    assert config in re.sub(r"\x1b\[[\d;]*m", "", lines[1])  # one line, at the left, however long
+    assert not set("│╭╰") & set(shown)
 
 
 def test_the_next_command_is_a_line_of_its_own(little: Path, monkeypatch, capsys, tmp_path: Path) -> None:
@@ -132,7 +106,10 @@ CASES = (
 )
 
 
-def test_a_mistyped_flag_is_one_line_with_what_to_type(monkeypatch, capsys):
+def test_a_mistyped_flag_is_one_line_without_colours_that_says_what_to_type(monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
+    for name in ("FORCE_COLOR", "NO_COLOR"):
+        monkeypatch.delenv(name, raising=False)
     for i, (command, words, *facts) in enumerate(CASES):
         monkeypatch.setenv("COLUMNS", "40" if i % 2 == 0 else "200")
         assert run_entry(monkeypatch, command.entrypoint, *words.split()) == 1, words
@@ -140,19 +117,22 @@ def test_a_mistyped_flag_is_one_line_with_what_to_type(monkeypatch, capsys):
         title, line = shown.err.splitlines()
         assert (shown.out, title) == ("", "Error")
         assert [fact for fact in facts if fact not in line] == [], line
-        assert not set("│╭╰─\\") & set(line)
+        assert not set("│╭╰─\\\x1b") & set(line)
 
 
 def test_a_warning_meanwhile_is_not_lost_nor_is_help(monkeypatch, capsys) -> None:
     assert run_entry(monkeypatch, lift.entrypoint, "--help") == 0
-    assert "usage: " in capsys.readouterr().out
+    assert "usage: " in (shown := capsys.readouterr().out) and "\x1b" not in shown
     with common.one_line_errors("command"):
         print("k is lowered", file=sys.stderr)
     assert capsys.readouterr().err == "k is lowered\n"
 
 
 def test_a_port_that_is_taken_is_told(monkeypatch, capsys):
-    def interrupted(_: object) -> None:
+    drawn: list[int] = []
+
+    def interrupted(server: WarmServer) -> None:
+        drawn.append(server.runs._max_gaussians)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(view, "check_lifted_run", lambda *_: None)
@@ -162,9 +142,9 @@ def test_a_port_that_is_taken_is_told(monkeypatch, capsys):
         taken.listen()
         port = taken.getsockname()[1]
         for host in ("127.0.0.1", "0.0.0.0"):
-            view.NormLiftView(Path("config.yml"), host=host, port=port).main()
+            view.NormLiftView(Path("config.yml"), host=host, port=port, max_gaussians=7).main()
     lines = capsys.readouterr().out.splitlines()
-    assert str(port) in lines[0] and len(lines) == 7
+    assert str(port) in lines[0] and len(lines) == 7 and drawn == [7, 7]
     for line in (lines[1], lines[4]):
         assert f"http://127.0.0.1:{port} " not in line and "http://127.0.0.1:" in line
     assert lines[2] == lines[6] == "Stopped." and "?access=" in lines[5]

@@ -19,7 +19,6 @@ from normlift_ns.lifted_run import write_run
 from normlift_ns.options import SourceOptions
 from normlift_ns.query.question import Query
 from normlift_ns.query.text_encoder import encoder_settings
-from tests.captures import SHARED
 from tests.nerfstudio_plugin.stock_run import StockRun, relocate_config, train_splatfacto, write_dataset
 
 
@@ -62,10 +61,10 @@ def stock_lifted(stock: StockRun, field: SemanticField, made_once: Callable[...,
     """config.yml of a lifted copy of the stock run with two stored queries."""
     encoder = encoder_settings(SourceOptions(encoder="color"))
     colored = replace(field, manifest={**field.manifest, "encoder": encoder})
-    question = Query(("left", "right"), torch.eye(8)[:2])
+    how = {"question": asking("left", "right"), "timestamp": "run"}
 
     def make(folder: Path) -> None:
-        write(opened(stock.config), colored, question=question, output_dir=folder, timestamp="run")
+        write(opened(stock.config), colored, output_dir=folder, **how)
 
     return made_once("stock-lifted", make) / "scene" / "normlift" / "run" / "config.yml"
 
@@ -78,14 +77,6 @@ def registered(nerfstudio: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
 
 
-@pytest.fixture(params=["fox", "tabletop"])
-def capture(request: pytest.FixtureRequest) -> Path:
-    config = SHARED / "captures" / "outputs" / request.param / "splatfacto" / "run" / "config.yml"
-    if not config.exists():
-        pytest.skip(f"needs the real captures, which are not part of the project: no {config}")
-    return config
-
-
 def trained_once(made_once: Callable[..., Path], name: str, write: Callable[[Path], Any], **how: Any) -> StockRun:
     def make(folder: Path) -> None:
         write(folder / "scene")
@@ -93,6 +84,11 @@ def trained_once(made_once: Callable[..., Path], name: str, write: Callable[[Pat
 
     folder = made_once(name, make)
     return StockRun(folder, folder / "outputs" / "scene" / "splatfacto" / "run" / "config.yml")
+
+
+def asking(*texts: str) -> Query:
+    """About the two objects of `lifted_field`, and up, which nothing is."""
+    return Query(texts, torch.eye(8)[[("left", "right", "up").index(text) for text in texts]])
 
 
 def opened(config: Path, **how: Any) -> Any:

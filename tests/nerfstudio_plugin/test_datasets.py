@@ -21,26 +21,23 @@ from tests.nerfstudio_plugin.conftest import opened, trained_once
 from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, StockRun, pose, write_dataset
 
 
-def write_project(folder: Path) -> Path:
-    """A COLMAP project of the pictures of `write_dataset`."""
-    write_dataset(folder)
-    (folder / "transforms.json").unlink()
-    camera = Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, k1=0.06)
-    names = [f"{i:03d}.jpg" for i in range(10)]
-    frames = [Frame(folder / "images" / name, name, pose(i)[:3], camera) for i, name in enumerate(names)]
-    points = np.random.default_rng(0).normal(size=(60, 3)) * 0.5
-    return write_colmap(folder, frames, points=points)
-
-
 @pytest.fixture(scope="session")
 def project(made_once: Callable[..., Path], _imported: None) -> StockRun:
-    """A run of `ns-train splatfacto --data scene colmap --colmap-path sparse/0`."""
+    """A run of `ns-train splatfacto --data scene colmap --colmap-path sparse/0`, of the images of `write_dataset`."""
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig  # noqa: PLC0415
+
+    def write(folder: Path) -> None:
+        write_dataset(folder)
+        (folder / "transforms.json").unlink()
+        camera = Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, k1=0.06)
+        names = [f"{i:03d}.jpg" for i in range(10)]
+        frames = [Frame(folder / "images" / name, name, pose(i)[:3], camera) for i, name in enumerate(names)]
+        write_colmap(folder, frames, points=np.random.default_rng(0).normal(size=(60, 3)) * 0.5)
 
     def configure(config: Any) -> None:
         config.pipeline.datamanager.dataparser = ColmapDataParserConfig(colmap_path=Path("sparse/0"))
 
-    return trained_once(made_once, "colmap-run", write_project, configure=configure)
+    return trained_once(made_once, "colmap-run", write, configure=configure)
 
 
 @pytest.fixture
@@ -76,17 +73,6 @@ def test_missing_small_images_are_refused_without_a_question(moved: Path, tmp_pa
     assert not (tmp_path / "x").exists()
 
 
-def test_what_nerfstudio_reads_first_is_checked_first(moved: Path, tmp_path: Path) -> None:
-    model = tmp_path / "moved" / "scene" / "sparse" / "0"
-    (model / "cameras.txt").write_text("1 PINHOLE wide")
-    with pytest.raises(InputError, match=r"cameras\.txt is damaged"):
-        opened(moved)
-    (model / "cameras.txt").unlink()
-    shutil.rmtree(model)
-    with pytest.raises(FileNotFoundError, match=r"sparse/0, the COLMAP reconstruction, is missing"):
-        opened(moved)
-
-
 def scene_of(copied: Path) -> Path:
     return copied.parents[4] / "scene"
 
@@ -100,15 +86,12 @@ def test_cameras_that_no_training_had_are_named(copied: Path) -> None:
         ({"frames": [frame]}, "same position .*: 1"),
         ({"frames": [frame, {**frame, "file_path": "images/001.jpg"}]}, "same position .*: 2"),
         ({"frames": [{**frame, "transform_matrix": turned}]}, "NaN"),
-        ({"w": 10**9}, "w is 1e[+]09"),
         ({"w": 65536, "h": 65536}, "268,435,456 pixels"),
-        ({"fl_x": -1}, "fl_x is -1"),
         ({"k1": 1e38}, "k1 is 1e[+]38"),
         ({"fl_x": None}, "fl_x .* images/000.jpg"),
         ({"camera_model": "CUBE"}, "CUBE"),
         ({"orientation_override": "sideways"}, "cannot read the dataset"),
         ({"frames": [{**frame, "file_path": "images\0"}, *keep]}, "not a valid file name"),
-        ({"frames": [[[[[[[[]]]]]]]]}, "form"),
         ({"frames": []}, "has no frames"),
         ({"w": 40}, r"000\.jpg .*48 x 36.*40 x 36"),
         ("{}", "`frames`"),
@@ -148,9 +131,7 @@ def test_a_damaged_transform_of_the_training_switches_nothing_off(copied: Path) 
     cases: list[tuple[Any, str]] = [
         ({"transform": unit, "scale": float("nan")}, "NaN"),
         ({"transform": unit, "scale": 0}, "rows: 3, scale: 0"),
-        ({"transform": unit[:2], "scale": 1}, "rows: 2, scale: 1"),
         ({"transform": [[1, 2], [3]], "scale": 1}, "transform"),
-        ({"scale": 1}, "`transform`"),
         ({"transform": unit, "scale": True}, "`float`, got `bool`"),
         ({"transform": [[1e200] * 4] * 3, "scale": 1}, "3 rows of 4 finite numbers"),
     ]
@@ -174,7 +155,6 @@ def test_pixels_that_nerfstudio_reads_wrong_are_refused(copied: Path) -> None:
             opened(copied)
     for make, message in (
         (lambda file: file.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 48 36\n"), "cannot be read"),
-        (lambda file: file.write_bytes(b""), "cannot be read as an image"),
         (lambda file: Image.new("RGB", (20, 10)).save(file), "is 20 x 10 pixels"),
         (os.mkfifo, "regular file"),
         (lambda file: file.mkdir(), "regular file"),
@@ -186,17 +166,10 @@ def test_pixels_that_nerfstudio_reads_wrong_are_refused(copied: Path) -> None:
 
 
 def test_pixels_that_people_see_otherwise_are_said_with_count_and_name(copied: Path) -> None:
-    images = scene_of(copied) / "images"
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    for name in ("002.jpg", "004.jpg"):
-        Image.open(images / name).save(images / name, exif=exif)
-    Image.new("CMYK", (WIDTH, HEIGHT)).save(images / "005.jpg")
-    grey, black = (Image.new("RGB", (WIDTH, HEIGHT), color) for color in ("grey", "black"))
-    grey.save(images / "006.jpg", "WEBP", save_all=True, append_images=[black])
-    expected = (("2 of 9", "EXIF", "002.jpg"), ("1 of 9", "CMYK", "005.jpg"), ("1 of 9", "several", "006.jpg"))
-    for remark, (count, what, name) in zip(opened(copied).remarks, expected, strict=True):
-        assert all(part in remark for part in (count, what, f"{images}/{name}")), remark
+    file = scene_of(copied) / "images" / "005.jpg"
+    Image.new("CMYK", (WIDTH, HEIGHT)).save(file)
+    (remark,) = opened(copied).remarks
+    assert all(part in remark for part in ("1 of 9", "CMYK", str(file)))
 
 
 def test_checkpoint_and_config_must_be_of_one_training(copied: Path) -> None:
@@ -245,6 +218,12 @@ def test_lists_of_a_project_without_test_images(moved: Path) -> None:
     shutil.copytree(folder, folder / "a")
     (scene_of(moved) / "train_list.txt").unlink()
     assert sum(name.startswith("images/a/00") for name in opened(moved).train.names) >= 8  # names of Windows
+    (model / "images.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"images\.bin is damaged"):
+        opened(moved)
+    shutil.rmtree(model)
+    with pytest.raises(FileNotFoundError, match=r"sparse/0, the COLMAP reconstruction, is missing"):
+        opened(moved)
 
 
 @pytest.mark.parametrize("start", ["C:\\scene\\", "/home/me/scene/"])
@@ -266,12 +245,6 @@ def test_datasets_of_another_machine(copied: Path, start: str) -> None:
     path.unlink()
     with pytest.raises(FileNotFoundError, match=r"transforms\.json is missing.* as it was during the training"):
         opened(copied, data=folder)
-    whole["frames"][0]["file_path"] = whole["frames"][1]["file_path"].replace("images", "right")
-    path.write_text(json.dumps(whole))
-    (folder / "right").mkdir()
-    (folder / "right" / "001.jpg").symlink_to(folder / "images" / "001.jpg")
-    with pytest.raises(InputError, match=r"share the file .*001\.jpg"):
-        opened(copied)
 
 
 def test_settings_of_other_versions(copied: Path) -> None:
@@ -289,11 +262,8 @@ def test_settings_of_other_versions(copied: Path) -> None:
         assert re.search(said, remark), remark
     for name, value in (("kernel_size", "0.1"), ("render_mode", "RGB+2D"), ("use_2dgs", "true")):
         copied.write_text(re.sub(r"^( *)sh_degree: 3", rf"\1sh_degree: 3\n\1{name}: {value}", text, flags=re.MULTILINE))
-        with pytest.raises(
-            InputError, match=rf"{name}: .*ns-export gaussian-splat .*--load-ply .*--world-transform"
-        ) as caught:
+        with pytest.raises(InputError, match=rf"{name}: .*ns-export gaussian-splat .*--load-ply .*--world-transform"):
             opened(copied)
-        assert "ns-train" not in str(caught.value)
     copied.write_text(text.replace("NerfstudioDataParserConfig", "ScanNetppDataParserConfig"))
     with pytest.raises(InputError, match=r"ScanNetpp.*ns-export gaussian-splat --load-config .*--load-ply"):
         opened(copied)

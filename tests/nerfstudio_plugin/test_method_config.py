@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -84,9 +85,7 @@ def test_nerfstudio_lists_its_methods_whatever_is_missing(missing: list[str], tm
 def test_an_error_of_any_kind_is_told_and_leaves_other_methods(monkeypatch, capsys) -> None:
     from normlift_ns.method_configs import entry  # noqa: PLC0415
 
-    def broken(name: str) -> None:
-        raise OSError("libcuda.so: cannot open shared object file")
-
+    broken = Mock(side_effect=OSError("libcuda.so: cannot open shared object file"))
     monkeypatch.setattr(entry, "import_module", broken)
     assert entry._load_method("scannet") is None
     assert "scannet cannot be used (OSError: libcuda.so: cannot" in capsys.readouterr().err

@@ -6,7 +6,6 @@ What the actions do to a state is tested in tests/session; here, that each widge
 import html
 import io
 import re
-import shutil
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
@@ -23,21 +22,17 @@ from plyfile import PlyData
 from normlift_ns.exports import TrainedSplat
 from normlift_ns.options import LiftOptions, SourceOptions
 from normlift_ns.query.engine import run_query
-from normlift_ns.query.question import Query, load_query
+from normlift_ns.query.question import load_query
 from normlift_ns.session import actions
 from normlift_ns.session.objects import list_objects
 from normlift_ns.session.selection import SelectionContext
 from normlift_ns.session.state import State
 from normlift_ns.viewer.widgets import Action
-from tests.nerfstudio_plugin.conftest import set_up
+from tests.nerfstudio_plugin.conftest import asking, set_up
 from tests.nerfstudio_plugin.stock_run import StockRun
 from tests.viewer.scenes import free_port, until
 
 NAMES = {"left": 0, "right": 1, "up": 2}
-
-
-def asking(*texts: str) -> Query:
-    return Query(texts, torch.eye(8)[[NAMES[text] for text in texts]])
 
 
 class Browser:
@@ -139,12 +134,6 @@ def adjust(panel: Any, *, refined: bool, reliability: float) -> None:
     until(lambda: (widgets._values[Action.REFINED], widgets._values[Action.RELIABILITY]) == (refined, reliability))
     with widgets._lock:  # held while the panel acts
         pass
-
-
-def button(panel: Any, label: str) -> Any:
-    """A button of the tab that has no name of its own."""
-    handles = panel._widgets._gui._gui_input_handle_from_id.values()
-    return next(handle for handle in handles if getattr(handle._impl, "label", "") == label)
 
 
 def said(panel: Any) -> str:
@@ -425,17 +414,18 @@ def slow(pipeline: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Slow,
     encoder.go_on.set()
 
 
-def in_thread(panel: Any, prompts: str) -> Thread:
-    panel._widgets.prompts.value = prompts
-    asking = Thread(target=press, args=[panel._widgets.ask])
-    asking.start()
-    return asking
-
-
-def test_the_button_shows_that_it_works_and_the_picture_stays_live(pipeline: Any, viewer: Any, slow: Any) -> None:
+def test_the_button_shows_that_it_works_and_of_many_questions_the_last_is_answered(
+    pipeline: Any, viewer: Any, slow: tuple[Slow, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     panel, (encoder, loaded) = pipeline.model.normlift, slow
-    before = chosen(pipeline)
-    asking = in_thread(panel, "right")
+    started, start, before = [], panel._turns.start, chosen(pipeline)
+    monkeypatch.setattr(panel._turns, "start", lambda what: (start(what), started.append(what))[0])
+    threads = []
+    for number, prompts in enumerate(("banana", "right"), 1):
+        panel._widgets.prompts.value = prompts
+        threads.append(Thread(target=press, args=[panel._widgets.ask]))
+        threads[-1].start()
+        until(lambda number=number: len(started) == number)
     assert encoder.reading.wait(60)
     assert viewer.train_lock.acquire(timeout=10)  # as the viewer does to render
     viewer.train_lock.release()
@@ -445,24 +435,12 @@ def test_the_button_shows_that_it_works_and_the_picture_stays_live(pipeline: Any
     assert panel.answer.texts == ("left",) and "Reading the prompts" in said(panel)
     assert panel._widgets.prompts.value == "right"  # what is typed is nobody else's
     encoder.go_on.set()
-    asking.join(60)
-    assert panel.answer.texts == ("right",) and "Reading the prompts" not in said(panel)
-    assert not panel._widgets.ask.disabled and not panel._widgets.cancel.visible
-    assert loaded == [str(pipeline.model.device)]
-
-
-def test_a_stale_answer_is_dropped(pipeline: Any, slow: tuple[Slow, list[str]], monkeypatch) -> None:
-    panel, (encoder, loaded) = pipeline.model.normlift, slow
-    started, start = [], panel._turns.start
-    monkeypatch.setattr(panel._turns, "start", lambda what: (start(what), started.append(what))[0])
-    threads = []
-    for number, prompts in enumerate(("right", "banana", "left; up"), 1):  # of many questions the last is shown
-        threads.append(in_thread(panel, prompts))
-        until(lambda number=number: len(started) == number)
-    encoder.go_on.set()
     for thread in threads:
         thread.join(60)
-    assert panel.answer.texts == ("left", "up") and "banana" not in said(panel) and len(loaded) == 1
+    assert panel.answer.texts == ("right",) and "banana" not in said(panel)
+    assert "Reading the prompts" not in said(panel)
+    assert not panel._widgets.ask.disabled and not panel._widgets.cancel.visible
+    assert loaded == [str(pipeline.model.device)]
 
 
 def ray(pipeline: Any) -> SimpleNamespace:
@@ -576,13 +554,3 @@ def test_a_panel_waits_for_a_field(pipeline: Any) -> None:
     pipeline.model.attach(field)
     assert not panel._widgets.ask.disabled
     assert said(panel).strip() == "No query yet."
-
-
-def test_a_copied_run_points_at_itself(stock_lifted: Path, registered: None, tmp_path: Path) -> None:
-    from nerfstudio.utils.eval_utils import eval_setup  # noqa: PLC0415
-
-    shutil.copytree(stock_lifted.parent, tmp_path / "copy")
-    assert "- normlift" in stock_lifted.read_text()
-    for folder in (stock_lifted.parent, tmp_path / "copy"):
-        model = eval_setup(folder / "config.yml")[1].model
-        assert model.config.semantics == model.normlift._folder == folder / "normlift"

@@ -39,19 +39,12 @@ def test_views_splits_and_world_are_those_of_the_training(stock: StockRun, monke
     datamanager = stock.pipeline.datamanager
     monkeypatch.setattr("nerfstudio.data.dataparsers.nerfstudio_dataparser.Nerfstudio._load_3D_points", pytest.fail)
     run = _assert_like_the_training(stock)
-    assert (len(run.gaussians), run.rasterize_mode) == (60, "classic")
     for views, dataset in ((run.train, datamanager.train_dataset), (run.held_out, datamanager.eval_dataset)):
         assert [file.name for file in views.files] == [file.name for file in dataset.image_filenames]
         camera = views.cameras[0]  # undistortion changes size and focal length
-        assert (camera.width, camera.height) == (WIDTH - 1, HEIGHT - 1)
-        assert float(camera.K[0, 0]) > FOCAL + 1
-        assert views[0].image.dtype == torch.uint8
-    assert run.train.names + run.held_out.names == [f"images/{i:03d}.jpg" for i in (*range(8), 9, 8)]
-    assert run.train[-1].name == "images/009.jpg"
+        assert (camera.width, camera.height) == (WIDTH - 1, HEIGHT - 1) and float(camera.K[0, 0]) > FOCAL + 1
     with pytest.raises(IndexError):
         run.train[9]
-    distorted = torch.from_numpy(np.array(Image.open(run.location.data / run.train.names[0])))
-    assert (run.train[0].image.int() - distorted[:-1, :-1].int()).abs().max() > 15
     trained = json.loads((stock.config.parent / "dataparser_transforms.json").read_text())
     assert run.dataparser_transform.tolist() == trained["transform"]
     assert run.dataparser_scale == trained["scale"] != 1
@@ -140,21 +133,15 @@ def test_masks_are_undistorted_with_their_images_and_named_with_them(tmp_path: P
 def test_images_that_are_missing_or_change_later_are_named(copied: Path) -> None:
     run = opened(copied)
     file = run.train.files[3]
-    content = file.read_bytes()
-    for part in (b"", content[: len(content) // 2]):
-        file.write_bytes(part)
-        with pytest.raises(InputError, match=r"images/003\.jpg cannot be read"):
-            run.train[3]
+    file.write_bytes(file.read_bytes()[:300])
+    with pytest.raises(InputError, match=r"images/003\.jpg cannot be read"):
+        run.train[3]
     Image.new("RGB", (20, 10)).save(file)
     with pytest.raises(InputError, match=r"003\.jpg .*20 x 10.*48 x 36"):
         run.train[3]
     file.unlink()
-    assert run.train[2].name == "images/002.jpg"
     with pytest.raises(FileNotFoundError, match=r"003\.jpg"):
         run.train[3]
-    run.train.files[7].unlink()
-    with pytest.raises(FileNotFoundError, match=rf"2 of 9, .* {file}.*--data"):
-        opened(copied)
     run.train.files[0].unlink()  # which nerfstudio opens to guess the downscaling
     with pytest.raises(FileNotFoundError, match=r"images/000\.jpg"):
         opened(copied)

@@ -27,6 +27,7 @@ from normlift_ns.data.nerfstudio.load import TrainedViews
 from normlift_ns.errors import InputError
 from normlift_ns.io.run_dir import FIELD_FOLDER
 from normlift_ns.lifted_run import _lifted_config
+from tests.captures import SHARED, needs_shared
 from tests.examples import examples
 from tests.nerfstudio_plugin.conftest import opened
 from tests.nerfstudio_plugin.stock_run import StockRun
@@ -279,11 +280,20 @@ def test_data_sets_of_blender(tmp_path: Path) -> None:
         parse_dataset(manager)
 
 
+@needs_shared
 @pytest.mark.slow
-@pytest.mark.parametrize("capture", ["fox"], indirect=True)  # whose lens is distorted
-def test_captures(capture: Path) -> None:
-    scene = opened(capture)
+def test_a_capture_whose_lens_is_distorted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene = opened(SHARED / "captures" / "outputs" / "fox" / "splatfacto" / "run" / "config.yml")
+    assert (scene.location.root, scene.checkpoint.step) == (SHARED / "captures", 11999)
     datamanager = deepcopy(scene.config.pipeline.datamanager)
     datamanager.data = datamanager.dataparser.data = scene.location.data
     datamanager.dataparser.load_3D_points = False
     assert_equal(datamanager, scene.location.folder)
+    files = sorted((SHARED / "fixtures" / "gsplat_weights").glob("fox_view*_classic.npz"))
+    assert len(files) >= 2
+    for file in files:  # cameras are those that gsplat's kernels got
+        fixture, camera = np.load(file), scene.train.cameras[int(file.name.split("_view")[1][:2])]
+        assert np.array_equal(camera.K.numpy(), fixture["K"])
+        assert np.abs(camera.world_to_camera.numpy() - fixture["w2c"]).max() < 1e-6
+        assert (camera.height, camera.width) == fixture["labels"].shape

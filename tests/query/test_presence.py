@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -72,19 +73,13 @@ def test_the_vectors_of_the_null_words_are_kept_for_later_lifts(tmp_path):
         asked.append(len(words))
         return torch.nn.functional.normalize(torch.arange(1.0, 2 * len(words) + 1).view(-1, 2), dim=1)
 
-    source: Any = SimpleNamespace(identity={"weights": "a"}, text=text)
-    encoder = {"encoder": "imagenet"}
-    first = null_vectors(source, encoder, tmp_path)
-    again = null_vectors(source, encoder, tmp_path)
+    def vectors(weights, text=text):
+        source: Any = SimpleNamespace(identity={"weights": weights}, text=text)
+        return null_vectors(source, {"encoder": "imagenet"}, tmp_path)
+
+    first, again = vectors("a"), vectors("a")
     assert first is not None and again is not None and torch.equal(again, first)
     assert asked == [len(null_words())]
-    other: Any = SimpleNamespace(identity={"weights": "b"}, text=text)
-    assert null_vectors(other, encoder, tmp_path) is not None
-    assert len(asked) == 2
-
-    def missing(words):
-        raise FileNotFoundError("weights x are missing")
-
-    lost: Any = SimpleNamespace(identity={"weights": "c"}, text=missing)
+    assert vectors("b") is not None and len(asked) == 2
     with pytest.warns(UserWarning, match="unrelated words.*weights x"):
-        assert null_vectors(lost, encoder, tmp_path) is None  # the lift goes on
+        assert vectors("c", Mock(side_effect=FileNotFoundError("weights x are missing"))) is None  # the lift goes on

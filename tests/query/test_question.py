@@ -89,16 +89,12 @@ def store(folder: Path, facts: object, **tensors: torch.Tensor) -> Path:
 def test_facts_have_their_types_and_ranges(tmp_path: Path) -> None:
     for changes, message in (
         ({"refined": "false"}, "bool.*str"),
-        ({"refined": 0}, "bool.*int"),
-        ({"threshold": "0.5"}, "float.*str"),
         ({"threshold": True}, "float.*bool"),
-        ({"threshold": None}, "float.*null"),
         ({"threshold": float("nan")}, "malformed"),
         ({"min_reliability": 1.5}, "float.*<= 1"),
         ({"min_reliability": -0.1}, "float.*>= 0"),
         ({"texts": "a"}, "array.*str"),
         ({"texts": []}, "length >= 1"),
-        ({"texts": [3]}, "str.*int"),
         ({"texts": [" "]}, "regex"),
         ({"negatives": ["b"]}, "1 negatives"),
         ({"form": "lerf"}, "'lerf'.*negatives"),
@@ -134,12 +130,9 @@ def test_a_question_of_another_run_is_refused(tmp_path: Path) -> None:
 def test_vectors_fit_the_texts(tmp_path: Path) -> None:
     for tensors, message in (
         ({"vectors": torch.eye(3)}, r"float32 \(3, 3\).* float32 \(1, 3\)"),
-        ({"vectors": torch.ones(3)}, r"float32 \(3,\)"),
-        ({"vectors": torch.tensor(1.0)}, r"float32 \(\)"),
         ({"vectors": torch.ones(1, 0)}, r"\(1, 0\)"),
         ({"vectors": torch.ones(1, 3, dtype=torch.float64)}, "float64"),
         ({"vectors": torch.zeros(1, 3)}, "'a' is zero"),
-        ({"vectors": torch.tensor([[1.0, torch.nan, 1.0]])}, r"nan\.\.nan"),
         ({"vectors": torch.tensor([[1.0, -torch.inf, 1.0]])}, "'a' is zero or not finite"),
         ({"negative_vectors": torch.ones(1, 3)}, "0 negatives"),
         ({"others": torch.ones(1, 3)}, "others"),
@@ -159,11 +152,9 @@ def test_vectors_fit_the_texts(tmp_path: Path) -> None:
 def test_a_question_that_could_not_be_loaded_is_not_stored(tmp_path: Path) -> None:
     for changes in (
         {"threshold": float("nan")},
-        {"threshold": float("inf")},
         {"min_reliability": 2.0},
         {"texts": ("a", " ")},
         {"embeddings": torch.zeros(2, 3)},
-        {"negatives": ()},
         {"texts": ("a", "\ud800")},
     ):
         with pytest.raises(InputError, match="cannot be stored"):

@@ -5,17 +5,13 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns import Camera, GaussianScene, rasterize_evidence
+from normlift_ns import rasterize_evidence
 from normlift_ns.query.sam3_query import mask_evidence
 from tests.random_scenes import dense, orbit_camera, random_scene
 
 
-def small_scene() -> tuple[GaussianScene, list[Camera]]:
-    return random_scene(40), [orbit_camera(angle, 40, 24) for angle in (0.0, 0.9, 2.1)]
-
-
 def test_shares_agreement_and_reliability_are_their_formulas():
-    scene, cameras = small_scene()
+    scene, cameras = random_scene(40), [orbit_camera(angle, 40, 24) for angle in (0.0, 0.9, 2.1)]
     g = torch.Generator().manual_seed(1)
     y = torch.arange(24)[:, None].expand(24, 40)
     upper, lower = y < 13, y > 9

@@ -41,13 +41,12 @@ def lifted(kind: str, tmp_path: Path) -> SemanticField:
         identity["pretrained"] = f"blake2b:{blake2b(path.read_bytes(), digest_size=16).hexdigest()}"
     features = {
         "regions": {"regions": {"kind": "grid"}, "levels": [], "encoder": identity},
-        "patches": {"kind": "patches", "count": 4, "encoder": identity},
         "langsplat": {"kind": "langsplat", "level": "l", "texts": identity},
     }
     return field_with(encoder_settings(source), features.get(kind, features["regions"]))
 
 
-@pytest.mark.parametrize("kind", ["regions", "patches", "langsplat", "version 0.1"])
+@pytest.mark.parametrize("kind", ["regions", "langsplat", "version 0.1"])
 def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
     path, field = tmp_path / "w.pt", lifted(kind, tmp_path)
     encoder = text_encoder_for(field, cache=tmp_path / "texts")

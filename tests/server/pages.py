@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,6 +52,15 @@ class OneRun:
 
 def make_server(served: ServedRun, **options: Any) -> WarmServer:
     return WarmServer(OneRun(served), ServerOptions(**options))  # type: ignore[arg-type]
+
+
+@contextmanager
+def running(server: WarmServer, **how: Any) -> Iterator[int]:
+    """The port of a server, which is stopped afterwards."""
+    try:
+        yield server.start(**how)
+    finally:
+        server.stop()
 
 
 def client_of(server: WarmServer) -> TestClient:

@@ -11,7 +11,7 @@ import pytest
 from normlift_ns import open_run
 from normlift_ns.server.app import ServerOptions, WarmServer
 from normlift_ns.server.runs import RunStore
-from tests.server.pages import make_served, make_server
+from tests.server.pages import make_served, make_server, running
 
 pytestmark = pytest.mark.skipif(find_spec("mcp") is None, reason="mcp is not installed")
 
@@ -58,19 +58,12 @@ async def walk(target: Any) -> list[str]:
         return names
 
 
-@pytest.fixture
-def server(lifted):
-    return WarmServer(RunStore([lifted], open_run), ServerOptions(port=0))
-
-
-def test_an_agent_walks_over_http(server, tmp_path):
+def test_an_agent_walks_over_http(lifted, tmp_path):
     from normlift_ns.server.mcp_tools import http_options  # noqa: PLC0415
 
-    port = server.start(**http_options(server, tmp_path / "exports"))
-    try:
+    server = WarmServer(RunStore([lifted], open_run), ServerOptions(port=0))
+    with running(server, **http_options(server, tmp_path / "exports")) as port:
         first, second = asyncio.run(walk(f"http://127.0.0.1:{port}/mcp"))
-    finally:
-        server.stop()
     assert first != second and (tmp_path / "exports" / first).read_bytes()[:3] == b"ply"
     assert {path.suffix for path in (tmp_path / "exports").iterdir()} == {".ply"}
 

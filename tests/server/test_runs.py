@@ -27,8 +27,9 @@ def gaussians(count: int = 4 * BLOCK) -> GaussianScene:
     return GaussianScene(torch.randn(count, 3, generator=g), quats, scales, torch.rand(count, generator=g))
 
 
-def test_the_faintest_and_smallest_of_too_many_are_left_out(tmp_path):
+def test_the_faintest_and_smallest_of_too_many_are_left_out_and_downloads_count_what_is_in_the_file(tmp_path):
     found = gaussians()
+    found.opacities[:3] = 1e-4
     served = make_served(tmp_path, scene_of(found, cameras=(camera(),)), world())
     few = ServedRun("few", served.run, 50)
     area = found.opacities * found.scales.topk(2, dim=1).values.prod(dim=1)
@@ -36,12 +37,6 @@ def test_the_faintest_and_smallest_of_too_many_are_left_out(tmp_path):
     visible = int((found.opacities >= 1 / 255).sum())
     assert few.describe(read_only=False)["num_left_out"] == visible - 50
     assert len(served.rows) == visible
-
-
-def test_the_message_of_a_download_counts_the_gaussians_in_the_file(tmp_path):
-    found = gaussians()
-    found.opacities[:3] = 1e-4
-    served = make_served(tmp_path, scene_of(found, cameras=(camera(),)), world())
     _, content, text = served.export(State(served.space), torch.ones(len(found), dtype=torch.bool), "all", "ply")
     written, left_out = map(int, re.findall(r": (\d+)\.", text))
     assert written == PlyData.read(io.BytesIO(content))["vertex"].count and written + left_out == len(found)

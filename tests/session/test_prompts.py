@@ -1,5 +1,7 @@
 """Rows of prompts: what is typed, clicked and saved."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -57,12 +59,8 @@ def test_what_is_wrong_with_the_line_or_the_encoder_is_an_error():
     for line, hint in ((" ;, \n", "Ask"), (",".join(map(str, range(MAX_PROMPTS + 1))), "65 .* 64")):
         with pytest.raises(InputError, match=hint):
             encode_prompts(line, read)
-
-    def without_weights(_):
-        raise FileNotFoundError("weights are gone")
-
     with pytest.raises(FileNotFoundError, match="weights are gone"):
-        encode_prompts("red", without_weights)
+        encode_prompts("red", Mock(side_effect=FileNotFoundError("weights are gone")))
 
 
 def test_a_click_is_asked_by_its_direction_and_beside_texts_by_the_rule_cosine_alone():

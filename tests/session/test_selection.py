@@ -10,7 +10,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.session import actions
 from normlift_ns.session.objects import list_objects
 from normlift_ns.session.prompts import Prompt, build_query, click_name, encode_prompts
-from normlift_ns.session.state import MAX_STATES, History, RequestTokens, State
+from normlift_ns.session.state import MAX_STATES, History, State
 from tests.session.worlds import BLOCK, ray, read, rows, world
 
 
@@ -103,22 +103,6 @@ def test_every_step_of_growth_holds_the_one_before(some, steps):
     assert steps < 0 or not bool((selected & ~more).any())
 
 
-def test_every_deed_is_undone_and_done_again():
-    clicks = [lambda s, at=at: actions.click(s, ray(at), "add") for at in (0, BLOCK)]
-    settings = [lambda s: actions.set_threshold(s, 0.95), lambda s: actions.resize(s, 1)]
-    ask, layer = (lambda s: asked("red", s)), (lambda s: actions.add_layer(s, "both"))
-    deeds = (ask, *clicks, layer, actions.hide, ask, *settings, actions.clear, actions.show_all)
-    history, seen = History.of(State(world()), lean=State.without_caches), [(rows(), ~rows())]
-    for deed in deeds:
-        history = history.do(deed(history.now))
-        seen.append((history.now.selection, history.now.drawn))
-    for steps, turn in ((seen[::-1], History.undo), (seen, History.redo)):
-        for expected in steps:
-            assert all(map(torch.equal, (history.now.selection, history.now.drawn), expected))
-            history = turn(history)
-        assert turn(history) is history
-
-
 @given(st.lists(st.one_of(st.integers(0, 9), st.sampled_from(["undo", "redo"]))))
 def test_a_history_is_a_list_with_a_place_in_it(steps):
     history, states, at = History.of(-1), [-1], 0
@@ -197,19 +181,6 @@ def test_poor_evidence_is_told_and_left_out():
     few = poor & rows(0, 1, 2)  # 20 % of what is selected
     few = actions.select(state, (few & (few.cumsum(0) <= 16)) | (~poor & rows(0, 1, 2)))
     assert 0 < few.weak_fraction < 0.25 and few.warning == ""
-
-
-def test_late_answers_do_not_count():
-    turns = RequestTokens()
-    first = turns.start("one")
-    second = turns.start("two")
-    assert (turns.is_current(first), turns.is_current(second)) == (False, True)
-    assert not turns.finish(first)
-    assert turns.busy == "two"
-    assert turns.cancel()
-    assert not turns.is_current(second) and not turns.finish(second)
-    assert not turns.cancel()
-    assert turns.busy == ""
 
 
 def test_a_file_is_called_after_what_selects_and_what_is_selected_by_hand_says_so():
