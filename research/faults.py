@@ -38,6 +38,7 @@ PACKAGES = (
     "distributed",
     "query",
     "rendering",
+    "server",
     "session",
     "viewer",
     "analysis",
