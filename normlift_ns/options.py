@@ -309,7 +309,7 @@ def check_prompt_list(name: str, texts: Sequence[str]) -> None:
         if not isinstance(text, str):
             raise InputError(f"{label} must be a string, got {short_repr(text)}")
         if text.strip() == "":
-            raise InputError(f"{label} is empty ({short_repr(text)}); remove it, or write what to search for")
+            raise InputError(f"{label} is empty ({short_repr(text)}); remove it, or write a prompt")
         if len(text) > MAX_PROMPT_LENGTH:
             raise InputError(f"{label} has {len(text):,} characters; shorten it to at most {MAX_PROMPT_LENGTH:,}")
         if _INVALID.search(text):
