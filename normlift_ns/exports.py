@@ -214,7 +214,7 @@ def write_splat(
 
 
 def _reason_for_no_rows(selected: int) -> str:
-    """Return the reason why none of the selected Gaussians can be written, with its cure."""
+    """Return the reason why none of the selected Gaussians can be written, with advice."""
     if selected == 0:
         return "no Gaussian is selected; select at least one"
     subject = "the only selected Gaussian is" if selected == 1 else f"all {selected:,} selected Gaussians are"
