@@ -727,8 +727,8 @@ class LiftOptions(CheckedOptions):
     weight_power: Literal[1, 2] = 1
     """Exponent of the rasterization weights A_ij: 1 as in the paper, or 2 for squared weights."""
     consensus: bool = True
-    """Before the lift, replace the feature of each region by the consensus of regions in other views that cover the
-    same Gaussians."""
+    """Before the lift, move the feature of each region toward those of regions in other views that cover the same
+    Gaussians."""
     consensus_power: float = 1.0
     """Exponent on the overlap fraction in the consensus, >= 0. Larger values down-weight regions that cover more than
     the target region. Needs --consensus True."""
