@@ -214,7 +214,7 @@ def write_splat(
 
 
 def _reason_for_no_rows(selected: int) -> str:
-    """Return the reason why none of the selected Gaussians can be written, with its cure."""
+    """Return the reason why none of the selected Gaussians can be written, with advice."""
     if selected == 0:
         return "no Gaussian is selected; select at least one"
     subject = "the only selected Gaussian is" if selected == 1 else f"all {selected:,} selected Gaussians are"
@@ -432,7 +432,9 @@ def label_cloud(
 
 
 def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, overwrite: bool = False) -> None:
-    """Write a cloud with additional vertex properties after the existing ones, and with all other content unchanged.
+    """Write a cloud as binary PLY, with additional vertex properties after the existing ones.
+
+    All other content is unchanged.
 
     Raises:
         ValueError: The vertices already have a property of one of these names.

@@ -200,11 +200,13 @@ class LiftedRun:
     def _checked(self, name: str, vector: Float[Tensor, " d"]) -> Float64[np.ndarray, " d"]:
         """Return the vector of a prompt as a NumPy array."""
         row = vector.detach().double().cpu().numpy()
-        if row.shape != (self.field.dimension,) or not np.isfinite(row).all() or not row.any():
+        if row.shape != (self.field.dimension,):
             raise InputError(
-                f"vectors[{name!r}] must be {self.field.dimension} finite numbers, like the features of the run, and "
-                f"not all zero; got shape {row.shape}"
+                f"vectors[{name!r}] must have shape ({self.field.dimension},), like the features of the run, got "
+                f"{row.shape}"
             )
+        if not np.isfinite(row).all() or not row.any():
+            raise InputError(f"vectors[{name!r}] must be finite and not zero, got length {np.linalg.norm(row):g}")
         return row
 
     def ask_stored(self) -> Answer | None:

@@ -309,7 +309,7 @@ def check_prompt_list(name: str, texts: Sequence[str]) -> None:
         if not isinstance(text, str):
             raise InputError(f"{label} must be a string, got {short_repr(text)}")
         if text.strip() == "":
-            raise InputError(f"{label} is empty ({short_repr(text)}); remove it, or write what to search for")
+            raise InputError(f"{label} is empty ({short_repr(text)}); remove it, or write a prompt")
         if len(text) > MAX_PROMPT_LENGTH:
             raise InputError(f"{label} has {len(text):,} characters; shorten it to at most {MAX_PROMPT_LENGTH:,}")
         if _INVALID.search(text):
@@ -727,8 +727,8 @@ class LiftOptions(CheckedOptions):
     weight_power: Literal[1, 2] = 1
     """Exponent of the rasterization weights A_ij: 1 as in the paper, or 2 for squared weights."""
     consensus: bool = True
-    """Before the lift, replace the feature of each region by the consensus of regions in other views that cover the
-    same Gaussians."""
+    """Before the lift, move the feature of each region toward those of regions in other views that cover the same
+    Gaussians."""
     consensus_power: float = 1.0
     """Exponent on the overlap fraction in the consensus, >= 0. Larger values down-weight regions that cover more than
     the target region. Needs --consensus True."""

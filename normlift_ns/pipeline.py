@@ -137,7 +137,7 @@ def lift_run(
         check_alignment: Compare a few training images with renders of the scene before the lift. Warn if they differ,
             and raise if they do not show the same scene.
         device: Device to lift on: auto, cpu or cuda.
-        export: Folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
+        export: Destination of a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: Progress callback, called with (stage, steps done, total steps).
         say: Callback for status lines and warnings, such as `print`.
     Raises:
@@ -385,8 +385,8 @@ def lift_scene(
         cache: Folder for 2D features and evidence. It is created if missing, and may be deleted at any time.
         device: Device for rasterizing, lifting and voting.
         encoder: Options that queries need to encode prompts in the same way. The manifest stores them.
-        export: Folder for a copy of the 2D features, as LangSplat files. If None, write no copy.
-        report: Progress callback, see `ProgressCallback`.
+        export: Destination of a copy of the 2D features, as LangSplat files. If None, write no copy.
+        report: Progress callback; see `ProgressCallback`.
     Raises:
         ValueError, FileNotFoundError: An image, a label map or an option is not valid, or no pixel is labeled.
         MemoryError: The lift does not fit into GPU memory.

@@ -34,7 +34,7 @@ class Registry(Generic[Plugin]):
     flag: str
     """Command-line option that selects a plugin."""
     default: str
-    """Name of a plugin that always works, which messages suggest as an alternative."""
+    """Value of `flag` that messages suggest as an alternative."""
 
     def names(self) -> list[str]:
         """Return the names of all plugins in alphabetical order, including those that fail to load."""

@@ -48,8 +48,9 @@ def test_vectors_are_asked_like_texts_and_arrays_come_out_as_numpy(run: nl.Lifte
     assert torch.allclose(cosine, run.field.query(torch.as_tensor(red)[None])[:, 0].double(), atol=1e-3)
     assert np.array_equal(np.asarray(run.image("0003", by_text)), run.render("0003", by_text).numpy())
     assert len(nl.open_run(lifted.parent).field) == len(run.field)
-    for wrong in (np.ones(3), np.zeros(run.field.dimension)):
-        with pytest.raises(ValueError, match=rf"vectors\['x'\] .* {run.field.dimension} finite"):
+    size = run.field.dimension
+    for wrong, expected in ((np.ones(3), rf"shape \({size},\)"), (np.zeros(size), "not zero")):
+        with pytest.raises(ValueError, match=rf"vectors\['x'\] .*{expected}"):
             run.ask(vectors={"x": wrong})
 
 

@@ -47,9 +47,9 @@ class RuleSettings(NamedTuple):
     no_direction: float
     """Relevancy of a Gaussian without a direction, which is never selected."""
     display_min: float
-    """Lower end of the color scale. Renders show smaller relevancies in the same color."""
+    """Lower end of the color scale of relevancy maps, which show smaller relevancies in the same color."""
     presence_limit: float | None
-    """Top relevancy below which a prompt is probably not in the scene; None if the limit depends on the encoder."""
+    """Smallest top relevancy for the verdict "found" (see `query.threshold.judge`); None if the rule has no limit."""
 
 
 def _sigmoid(values: Any) -> Any:

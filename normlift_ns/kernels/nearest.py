@@ -117,7 +117,7 @@ def build_kd_tree(points: Float32[Tensor, "n 3"], communicator: GatheringProcess
 def _split(
     index: Int64[Tensor, " slots"], points: Float32[Tensor, "slots 3"], count: int
 ) -> tuple[Int64[Tensor, " slots"], Float32[Tensor, "slots 3"]]:
-    """Sort the points of each of `count` nodes along its longest side, so that they can be split in the middle."""
+    """Sort the points of each of `count` nodes along its longest side, so that each node can be split in the middle."""
     nodes = points.view(count, -1, 3)
     low, high = _box(nodes)
     axis = (high - low).nan_to_num(-1).argmax(dim=1)

@@ -343,7 +343,7 @@ def contact_sheet(
 
     Args:
         header: Title and summary above the figure.
-        panels: Overlay of each view with an outline of the selection, of the width `_panel_width`.
+        panels: Overlay of each view with an outline of the selection, no wider than `_panel_width`.
         views: Names of the views.
     """
     return _page(sheet, [header.title, header.summary], panels, views, _columns(len(panels)))

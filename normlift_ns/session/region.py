@@ -12,7 +12,7 @@ from normlift_ns.options import RasterizeMode
 from normlift_ns.rasterization.rasterize import render
 
 _RENDER_SIZE = 320
-"""Longer side, in pixels, of the render for visibility."""
+"""Maximum longer side, in pixels, of the render for visibility."""
 _MARGIN = 0.03
 
 
