@@ -177,8 +177,8 @@ def write_splat(
         overwrite: Replace existing files.
     Raises:
         FileExistsError: A file exists, and `overwrite` is False.
-        ValueError: No Gaussian is left to write, the file name has the ending of an unsupported format,
-            `labels.objects` cannot be encoded as JSON, or a Gaussian is too far from the origin for SPZ.
+        ValueError: No Gaussian is left to write, the file name has the ending of an unsupported format, or
+            `labels.objects` cannot be encoded as JSON. Also if a Gaussian is too far from the origin for SPZ.
         OSError: A file cannot be written, for instance because the disk is full.
     """
     columns = splat.columns()

@@ -108,9 +108,9 @@ class NormLiftQuery(CheckedOptions):
     instance_id in exports, and text is the prompt of the object. centroid is the mean position, weighted by evidence.
     box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z. Both span the
     1st to 99th percentile. R is the mean reliability. views counts the training images that show the object with at
-    least a tenth of its largest visible area. best views has up to three of them: first those with the whole object,
-    then others, both sorted by the area of the object in the image. If there are more than 40 objects, the table lists
-    only the 10 largest, and a line below counts the objects of each prompt."""
+    least a tenth of its largest visible area. best views has up to three of them. Images of the whole object come
+    first. Among these and among the others, images that show the object larger come first. If there are more than 40
+    objects, the table lists only the 10 largest, and a line below counts the objects of each prompt."""
     objects_dir: Path | None = None
     """Folder for the list of --objects or --inventory in capture and scene coordinates, with the axes of the boxes. The
     files are objects.json and objects.csv, and objects.ply and objects_scene.ply with the meshes of the boxes.
@@ -543,8 +543,8 @@ def print_answer(
 ) -> None:
     """Print the table of an answer, and notes on some of its prompts.
 
-    These are prompts without a clear match, prompts that are encoded only in part, and prompts that select at least
-    twice as many Gaussians as at the suggested threshold.
+    Notes are printed for prompts without a clear match, and for prompts that are encoded only in part. They are also
+    printed for prompts that select at least twice as many Gaussians as at the suggested threshold.
     """
     rule = f"{question.rule} > {question.threshold:.4g}"
     narrow = common.CONSOLE.width < 100

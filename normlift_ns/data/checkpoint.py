@@ -158,8 +158,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is damaged, contains no Gaussians or is not a splatfacto checkpoint, or the step is invalid
-            or differs from the step in the file name.
+        ValueError: The file is damaged, contains no Gaussians or is not a splatfacto checkpoint. Also if the step is
+            invalid or differs from the step in the file name.
     """
     advice = "give another checkpoint with --load-step"
     loaded = load_torch_archive(path, "as ns-train splatfacto writes them", advice)
