@@ -106,10 +106,9 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     causes = "Likely causes: " + (
         "the images, their exposure or the cameras have changed since the training, or the training was stopped early"
         if trained_cameras
-        else "cameras of another capture; cameras in a world that --world-transform auto does not try (give a file "
-        "with the transform; for gsplat's trainer see --gsplat-normalize); other images, or distorted images with "
-        "cameras for undistorted ones; a different exposure from the training images; much smaller copies of the "
-        "training images; or another --rasterize-mode or --background"
+        else "cameras of another capture, or in another world than the splat (give a file with --world-transform; for "
+        "gsplat's trainer, see --gsplat-normalize); images that are distorted, have a different exposure or are much "
+        "smaller than the training images; or another --rasterize-mode or --background"
     )
     if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(
