@@ -91,8 +91,8 @@ class NormLiftQuery(CheckedOptions):
     """Names of the training images, such as 0001 0042, whose cameras render the scene. Without names, the command uses
     three evenly spaced images."""
     explain: bool = False
-    """List the images whose evidence supports the selection, with the weight, the agreement and the number of regions
-    of each."""
+    """For each prompt, list up to three images with the largest weight in the selection, and up to three others that
+    disagree. The columns are the weight, its share, the agreement, the disagreement and the number of regions."""
     explain_dir: Path | None = None
     """Folder for the images of --explain, with outlines of the regions that contributed."""
     segment: Literal["sam3"] | None = None
@@ -412,7 +412,7 @@ class NormLiftQuery(CheckedOptions):
 
 
 def read_vocabulary(path: Path) -> list[str]:
-    """Read the words of a text file, one per line, and skip empty lines.
+    """Read the words of a text file, one per line, and skip empty lines and duplicates.
 
     Raises:
         OSError, ValueError: The file cannot be read, is not UTF-8 text, or has no words.
