@@ -378,7 +378,9 @@ def read_cloud(path: Path) -> PlyData:
     if vertex is None or not set("xyz") <= set(names) or vertex.count == 0:
         count = 0 if vertex is None else vertex.count
         properties = ", ".join(names) or "none"
-        raise InputError(f"{path} has {count:,} vertices with the properties: {properties}. {expected}")
+        raise InputError(
+            f"{path} has no points with positions (number of vertices: {count:,}, properties: {properties}). {expected}"
+        )
     lists = [name for name, item in names.items() if hasattr(item, "len_dtype")]
     if len(lists) > 0:
         raise InputError(f"{path} has vertices with list properties ({', '.join(lists)}); remove these. {expected}")
