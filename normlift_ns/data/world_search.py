@@ -240,7 +240,7 @@ def _draw_points(scene: SplatScene, views: Sequence[ReducedView]) -> _Points:
 
 
 def _is_best_nearby(scene: SplatScene, device: str) -> bool:
-    """Return True if the images fit worse after any rotation of the world by one degree about an axis.
+    """Return True if no rotation of the world by one degree about an axis improves the fit to the images.
 
     A world that is only close to the correct one can reach the usual PSNR, but one of the rotations improves its fit.
     """
