@@ -432,7 +432,9 @@ def label_cloud(
 
 
 def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, overwrite: bool = False) -> None:
-    """Write a cloud with additional vertex properties after the existing ones, and with all other content unchanged.
+    """Write a cloud as a binary PLY file with additional vertex properties after the existing ones.
+
+    All other values, elements and comments stay unchanged.
 
     Raises:
         ValueError: The vertices already have a property of one of these names.

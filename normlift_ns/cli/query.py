@@ -249,7 +249,7 @@ class NormLiftQuery(CheckedOptions):
             row["why"] = None if why is None else explanation_to_json(votes.names, why)
         if self.explain_dir is not None:
             save_vote_images(votes, result.question.texts, reasons, self.explain_dir, overwrite=self.overwrite)
-        return lambda: print_explanations(votes.names, result.question.texts, reasons)
+        return lambda: print_explanations(votes.names, result.question.texts, reasons, self.explain_dir)
 
     def _segment(self, result: Answer, rows: list[dict[str, Any]]) -> tuple[dict[str, Any], Callable[[], None]]:
         """Segment training views with SAM 3 for the same prompts, lift the masks, and add their summary to every row.
@@ -721,15 +721,25 @@ def save_vote_images(
             Image.fromarray(picture.image.numpy()).save(draft, format="PNG")
 
 
-def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None]) -> None:
-    """Print a table of images, and for each prompt a sentence about their agreement."""
+def print_explanations(
+    names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None], folder: Path | None = None
+) -> None:
+    """Print a table of images, and for each prompt a sentence about their agreement.
+
+    Args:
+        names: Names of all images.
+        texts: Prompts.
+        reasons: Explanation of each prompt, or None if it selects nothing.
+        folder: Folder of `save_vote_images`; None if there is none.
+    """
     result = explanation_table(names, texts, reasons, narrow=common.CONSOLE.width < 120)
     if result.row_count > 0:
         common.CONSOLE.print(result)
     for text, why in zip(texts, reasons):
         common.info(f"{text}: {'nothing is selected, so nothing can be explained.' if why is None else why.sentence}")
     if any(why is not None for why in reasons):
-        common.info("Images can agree on a wrong answer; the outlined regions show what they agree on.")
+        advice = "add --explain-dir FOLDER" if folder is None else f"open the images in {folder}"
+        common.info(f"Images can agree on a wrong answer. To see the regions that contributed, {advice}.")
 
 
 def explanation_table(
