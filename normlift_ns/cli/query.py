@@ -562,7 +562,10 @@ def print_answer(
 
 
 def _is_loose(row: dict[str, Any], threshold: float) -> bool:
-    """Return True if a prompt selects at least twice as many Gaussians as at its suggested threshold."""
+    """Return True if a prompt selects at least twice as many Gaussians as at its suggested threshold.
+
+    The numbers are estimated from the histogram of the prompt.
+    """
     if row["histogram"] is None:
         return False
     counts, low, high = (row["histogram"][name] for name in ("counts", "low", "high"))

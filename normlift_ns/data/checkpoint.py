@@ -124,7 +124,7 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
     """Return the path of the checkpoint of a step, or of the last step if `step` is None.
 
     Raises:
-        FileNotFoundError: The folder has no such checkpoint. The message lists the existing steps.
+        FileNotFoundError: The folder has no such checkpoint. The message lists the existing steps, if there are any.
     """
     found = sorted(folder.glob("step-*.ckpt"))
     checkpoints = {number: path for path in found if (number := _step_of(path)) is not None}
