@@ -378,9 +378,10 @@ def read_cloud(path: Path) -> PlyData:
     names = {} if vertex is None else {item.name: item for item in vertex.properties}
     if vertex is None or not set("xyz") <= set(names) or vertex.count == 0:
         count = 0 if vertex is None else vertex.count
-        properties = f"the properties {', '.join(names)}" if len(names) > 0 else "no properties"
-        vertices = "vertex" if count == 1 else "vertices"
-        raise InputError(f"{path} has {count:,} {vertices} with {properties}. {expected}")
+        properties = ", ".join(names) or "none"
+        raise InputError(
+            f"{path} has no points with positions (number of vertices: {count:,}, properties: {properties}). {expected}"
+        )
     lists = [name for name, item in names.items() if hasattr(item, "len_dtype")]
     if len(lists) > 0:
         raise InputError(f"{path} has vertices with list properties ({', '.join(lists)}); remove these. {expected}")
@@ -432,9 +433,9 @@ def label_cloud(
 
 
 def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, overwrite: bool = False) -> None:
-    """Write a cloud as binary PLY, with additional vertex properties after the existing ones.
+    """Write a cloud as a binary PLY file with additional vertex properties after the existing ones.
 
-    All other content is unchanged.
+    All other values, elements and comments stay unchanged.
 
     Raises:
         ValueError: The vertices already have a property of one of these names.

@@ -512,9 +512,9 @@ class SourceOptions:
     --get edges. patches: patches of a vision transformer. superpixel: pixels of similar color and position. grid:
     squares. files: label maps from --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise,
     auto selects superpixel for the encoder color. For a neural network on a GPU, it selects the first of sam, edges and
-    patches that this machine and the network support, or else superpixel. On a CPU, it does the same without sam, and
-    patches come before edges if the network encodes each region as a crop, as CLIP does. Any other name: a mask source
-    from an installed plugin."""
+    patches that this machine and the network support. If there is none, it selects superpixel. On a CPU, it does the
+    same without sam. Patches then come before edges if the network encodes each region as a crop, as CLIP does. Any
+    other name: a mask source from an installed plugin."""
     sam3_prompts: tuple[str, ...] = ()
     """Prompts for the masks of --regions sam3. If there are none, SAM 3 uses the prompts of --queries."""
     region_count: int | None = None
@@ -522,8 +522,8 @@ class SourceOptions:
     regions. None: 256 for superpixel and grid, 1024 for patches, and the number that --level sets for edges."""
     sam_model: str | None = None
     """Weights of SAM, SAM 2 or HQ-SAM: a folder in transformers format, a checkpoint of the original SAM, or a model
-    name to download, such as facebook/sam2.1-hiera-large. --regions sam3 needs weights of SAM 3. None:
-    facebook/sam-vit-huge as in LangSplat, or facebook/sam3 for --regions sam3."""
+    name such as facebook/sam2.1-hiera-large. --regions sam3 needs weights of SAM 3. None: facebook/sam-vit-huge as in
+    LangSplat, or facebook/sam3 for --regions sam3."""
     sam_precision: SamPrecision = "auto"
     """Floating-point precision of the SAM network. auto: float16 on a GPU, float32 otherwise."""
     regions_dir: Path | None = None
@@ -594,9 +594,9 @@ class SplatOptions:
     x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY file. None: no search, and no
     transform except that of --gsplat-normalize."""
     gsplat_normalize: bool = True
-    """For a splat from gsplat's trainer: assume that the trainer normalized the world, unless the trainer's cfg.yml
-    records otherwise, and recompute the normalization from the COLMAP project. For other splats, --world-transform auto
-    also tries this normalization."""
+    """For a splat from gsplat's trainer: assume that the trainer normalized the world, and recompute the normalization
+    from the COLMAP project. The setting in the trainer's cfg.yml takes precedence. For other splats, --world-transform
+    auto also tries this normalization."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None
@@ -604,8 +604,8 @@ class SplatOptions:
     Inria's trainer with --eval use 8. None: as in the cfg.yml of gsplat's trainer or the cfg_args of Inria's trainer,
     or else the held-out images in transforms.json."""
     eval_images: tuple[str, ...] = ()
-    """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction such as
-    0.1, which is the default of ns-train."""
+    """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction. The
+    fraction 0.1 is the default of ns-train."""
     rasterize_mode: RasterizeMode | None = None
     """Rasterization mode that the splat was trained with. None: as recorded in the file, in the cfg.yml of gsplat's
     trainer or in the cfg_args of Inria's trainer, else classic."""

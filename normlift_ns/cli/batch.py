@@ -102,7 +102,7 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
 
 
 def is_lifted(run: Path) -> bool:
-    """Return True if a lifted run with a valid manifest exists.
+    """Return True if a lifted run with a valid manifest exists; False if the path does not exist.
 
     Raises:
         InputError: The path exists, but is not a lifted run or is a damaged one.

@@ -50,12 +50,12 @@ class NormLiftEval(CheckedOptions):
     """Evaluate the directions after the vote. False: evaluate the directions before the vote."""
     study: tuple[Literal["ablation", "sweeps", "signals", "timing", "baselines", "coverage"], ...] = ()
     """Additional studies, which load all runs into memory. ablation: scores of variants of the vote, with and without
-    consensus. sweeps: scores for a fixed list of values of each of beta, k, sigma_d, tau, gamma and delta, and for
-    their defaults and the values of the run. signals: the share of Gaussians without evidence, accuracy by reliability
-    and by the norm of the mean feature, and a comparison of reliability with opacity. timing: seconds of the lift and,
-    on a GPU, of the method of SFS (Splat Feature Solver), which composites 512 channels with gsplat. baselines: scores
-    of techniques from SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage: regions
-    without reliable evidence, unused images that would help, and new camera poses, as renders and as a camera path."""
+    consensus. sweeps: scores for different values of beta, k, sigma_d, tau, gamma and delta, including the defaults and
+    the values of the run. signals: the share of Gaussians without evidence, accuracy by reliability and by the norm of
+    the mean feature, and a comparison of reliability with opacity. timing: seconds of the lift and, on a GPU, of the
+    method of SFS (Splat Feature Solver), which composites 512 channels with gsplat. baselines: scores of techniques
+    from SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage: regions without
+    reliable evidence, unused images that would help, and new camera poses, as renders and as a camera path."""
     compare: Literal["paper"] | None = None
     """Published results to compare with yours, in the printed tables and in the output file. paper: results of the
     paper for --protocol scannet or lerf, and for the studies ablation, signals and timing."""

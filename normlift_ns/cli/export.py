@@ -63,7 +63,7 @@ class NormLiftExport(options.CheckedOptions):
     Each exporter writes <name>_<exporter> with its own suffix to the output folder."""
     transfer: Path | None = None
     """PLY point cloud or mesh to label. The command writes a copy, <name of the cloud>_labels.ply, with the class_id,
-    instance_id and relevancies of the nearest visible Gaussian, or 0 if no Gaussian is near enough."""
+    instance_id and relevancies of the nearest visible Gaussian. They are 0 if no Gaussian is near enough."""
     transfer_distance: float = options.MAX_TRANSFER_DISTANCE
     """Maximum distance from a point to the center of its Gaussian for --transfer, > 0. Larger values label more points.
     The unit is the median distance from a Gaussian to the nearest one at another position."""

@@ -260,7 +260,10 @@ class NormLift(CheckedOptions):
 
 @contextmanager
 def progress_bars() -> Iterator[ProgressCallback]:
-    """Show a progress bar for each stage, or a line if the output goes to a pipe or a log file."""
+    """Show a progress bar for each stage, or print a line if the output goes to a pipe or a log file.
+
+    With --quiet, nothing is printed.
+    """
     names = {"features": "2D features", "lift": "lift, reliability", "store": "choosing storage"}
     columns = (
         TextColumn("{task.description:>17}", markup=False),

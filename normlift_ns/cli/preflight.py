@@ -24,12 +24,12 @@ from normlift_ns.options import (
 
 
 def check_readable_file(path: Path | None, flag: str) -> None:
-    """Raise an error if a path does not exist, is not a regular file, or is not readable. Do nothing for None."""
+    """Raise an error if a path does not exist, is not a regular file, or is not readable. Ignore None."""
     _check_readable(path, flag, "a file", "a file")
 
 
 def check_readable_folder(path: Path | None, flag: str) -> None:
-    """Raise an error if a path does not exist, is not a folder, or is not readable. Do nothing for None."""
+    """Raise an error if a path does not exist, is not a folder, or is not readable. Ignore None."""
     _check_readable(path, flag, "a folder", "the folder that contains the files")
 
 
@@ -74,7 +74,7 @@ def _check_access(path: Path, flag: str) -> None:
 
 
 def check_new_files(*paths: Path | None, overwrite: bool, flags: str) -> None:
-    """Raise an error if a file cannot be written, or if it exists and `overwrite` is False. Paths can be None."""
+    """Raise an error if a file cannot be written, or if it exists and `overwrite` is False. Ignore None."""
     files = [path for path in paths if path is not None]
     refuse_existing(*files, overwrite=overwrite, flags=flags)
     for path in files:
@@ -82,7 +82,7 @@ def check_new_files(*paths: Path | None, overwrite: bool, flags: str) -> None:
 
 
 def check_writable_file(path: Path | None, flag: str) -> None:
-    """Raise InputError or OSError if a file cannot be written. Its parent folders need not exist. None is valid."""
+    """Raise InputError or OSError if a file cannot be written. Its parent folder need not exist. Ignore None."""
     if path is None:
         return
     if path.name == "":
@@ -91,7 +91,7 @@ def check_writable_file(path: Path | None, flag: str) -> None:
 
 
 def check_writable_folder(path: Path | None, flag: str) -> None:
-    """Raise InputError or OSError if a folder cannot be written. It need not exist. None is valid."""
+    """Raise InputError or OSError if a folder cannot be written. It need not exist. Ignore None."""
     for parent in () if path is None else (path, *path.absolute().parents):
         mode = _mode(parent, flag)
         if mode is None:

@@ -91,8 +91,8 @@ class NormLiftQuery(CheckedOptions):
     """Names of the training images, such as 0001 0042, whose cameras render the scene. Without names, the command uses
     three evenly spaced images."""
     explain: bool = False
-    """List the images whose evidence supports the selection, with the weight, the agreement and the number of regions
-    of each."""
+    """For each prompt, list up to three images with the largest weight in the selection, and up to three others that
+    disagree. The columns are the weight, its share, the agreement, the disagreement and the number of regions."""
     explain_dir: Path | None = None
     """Folder for the images of --explain, with outlines of the regions that contributed."""
     segment: Literal["sam3"] | None = None
@@ -108,9 +108,9 @@ class NormLiftQuery(CheckedOptions):
     instance_id in exports, and text is the prompt of the object. centroid is the mean position, weighted by evidence.
     box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z. Both span the
     1st to 99th percentile. R is the mean reliability. views counts the training images that show the object with at
-    least a tenth of its largest visible area. best views has up to three of them: first those with the whole object,
-    then others, both sorted by the area of the object in the image. If there are more than 40 objects, the table lists
-    only the 10 largest, and a line below counts the objects of each prompt."""
+    least a tenth of its largest visible area. best views has up to three of them. Images of the whole object come
+    first. Among these and among the others, images that show the object larger come first. If there are more than 40
+    objects, the table lists only the 10 largest, and a line below counts the objects of each prompt."""
     objects_dir: Path | None = None
     """Folder for the list of --objects or --inventory in capture and scene coordinates, with the axes of the boxes. The
     files are objects.json and objects.csv, and objects.ply and objects_scene.ply with the meshes of the boxes.
@@ -249,7 +249,7 @@ class NormLiftQuery(CheckedOptions):
             row["why"] = None if why is None else explanation_to_json(votes.names, why)
         if self.explain_dir is not None:
             save_vote_images(votes, result.question.texts, reasons, self.explain_dir, overwrite=self.overwrite)
-        return lambda: print_explanations(votes.names, result.question.texts, reasons)
+        return lambda: print_explanations(votes.names, result.question.texts, reasons, self.explain_dir)
 
     def _segment(self, result: Answer, rows: list[dict[str, Any]]) -> tuple[dict[str, Any], Callable[[], None]]:
         """Segment training views with SAM 3 for the same prompts, lift the masks, and add their summary to every row.
@@ -412,7 +412,7 @@ class NormLiftQuery(CheckedOptions):
 
 
 def read_vocabulary(path: Path) -> list[str]:
-    """Read the words of a text file, one per line, and skip empty lines.
+    """Read the words of a text file, one per line, and skip empty lines and duplicates.
 
     Raises:
         OSError, ValueError: The file cannot be read, is not UTF-8 text, or has no words.
@@ -543,8 +543,8 @@ def print_answer(
 ) -> None:
     """Print the table of an answer, and notes on some of its prompts.
 
-    These are prompts without a clear match, prompts that are encoded only in part, and prompts that select at least
-    twice as many Gaussians as at the suggested threshold.
+    Notes are printed for prompts without a clear match, and for prompts that are encoded only in part. They are also
+    printed for prompts that select at least twice as many Gaussians as at the suggested threshold.
     """
     rule = f"{question.rule} > {question.threshold:.4g}"
     narrow = common.CONSOLE.width < 100
@@ -562,7 +562,10 @@ def print_answer(
 
 
 def _is_loose(row: dict[str, Any], threshold: float) -> bool:
-    """Return True if a prompt selects at least twice as many Gaussians as at its suggested threshold."""
+    """Return True if a prompt selects at least twice as many Gaussians as at its suggested threshold.
+
+    The numbers are estimated from the histogram of the prompt.
+    """
     if row["histogram"] is None:
         return False
     counts, low, high = (row["histogram"][name] for name in ("counts", "low", "high"))
@@ -721,15 +724,25 @@ def save_vote_images(
             Image.fromarray(picture.image.numpy()).save(draft, format="PNG")
 
 
-def print_explanations(names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None]) -> None:
-    """Print a table of images, and for each prompt a sentence about their agreement."""
+def print_explanations(
+    names: Sequence[str], texts: Sequence[str], reasons: Sequence[Why | None], folder: Path | None = None
+) -> None:
+    """Print a table of images, and for each prompt a sentence about their agreement.
+
+    Args:
+        names: Names of all images.
+        texts: Prompts.
+        reasons: Explanation of each prompt, or None if it selects nothing.
+        folder: Folder of `save_vote_images`; None if there is none.
+    """
     result = explanation_table(names, texts, reasons, narrow=common.CONSOLE.width < 120)
     if result.row_count > 0:
         common.CONSOLE.print(result)
     for text, why in zip(texts, reasons):
         common.info(f"{text}: {'nothing is selected, so nothing can be explained.' if why is None else why.sentence}")
     if any(why is not None for why in reasons):
-        common.info("Images can agree on a wrong answer; the outlined regions show what they agree on.")
+        advice = "add --explain-dir FOLDER" if folder is None else f"open the images in {folder}"
+        common.info(f"Images can agree on a wrong answer. To see the regions that contributed, {advice}.")
 
 
 def explanation_table(

@@ -30,8 +30,8 @@ class NormLiftServe(ServeOptions):
     """Paths to the config.yml files of lifted runs."""
     mcp: bool = False
     """Also serve tools of the Model Context Protocol, at /mcp. If standard input is a pipe, as when an agent starts
-    this command, serve only these tools, on standard input and output, without the page and the HTTP API. Needs pip
-    install 'normlift-ns[mcp]'."""
+    this command, serve only these tools, on standard input and output. The page and the HTTP API are then not
+    available. Needs pip install 'normlift-ns[mcp]'."""
     export_dir: Path | None = None
     """Folder in which the tools of --mcp may write files. None: the tools write no files."""
 

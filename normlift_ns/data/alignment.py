@@ -40,7 +40,7 @@ class Alignment(NamedTuple):
     margin: float
     """Median lead over the views, in dB: the PSNR of the render minus the PSNR of the image's mean color."""
     cause: str | None = None
-    """Sentence about another lens or primitive that fits the images better; None if none was found."""
+    """Sentence about another lens or primitive that fits the images better; None if none was found or searched."""
 
     @property
     def is_usual(self) -> bool:
@@ -57,8 +57,8 @@ def measure_alignment(
         scene: Gaussians, cameras and images.
         settings: Constants of the rasterizer at the original image size. None: the constants that the scene records.
         device: torch device to render on.
-        explain: True to look for a better lens or primitive in any case. False to skip this search if the PSNR or the
-            margin is below the usual minimum. See `explain_misfit`.
+        explain: False to skip the search for a `cause` if the renders do not reach the usual PSNR or margin; see
+            `explain_misfit`.
     Raises:
         FileNotFoundError, ValueError: An image is missing or cannot be read.
     """
@@ -106,10 +106,9 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     causes = "Likely causes: " + (
         "the images, their exposure or the cameras have changed since the training, or the training was stopped early"
         if trained_cameras
-        else "cameras of another capture; cameras in a world that --world-transform auto does not try (give a file "
-        "with the transform; for gsplat's trainer see --gsplat-normalize); other images, or distorted images with "
-        "cameras for undistorted ones; a different exposure from the training images; much smaller copies of the "
-        "training images; or another --rasterize-mode or --background"
+        else "cameras of another capture, or in another world than the splat (give a file with --world-transform; for "
+        "gsplat's trainer, see --gsplat-normalize); images that are distorted, have a different exposure or are much "
+        "smaller than the training images; or another --rasterize-mode or --background"
     )
     if match.visible_fraction < _MIN_VISIBLE:
         raise InputError(

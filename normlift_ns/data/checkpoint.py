@@ -124,7 +124,7 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
     """Return the path of the checkpoint of a step, or of the last step if `step` is None.
 
     Raises:
-        FileNotFoundError: The folder has no such checkpoint. The message lists the existing steps.
+        FileNotFoundError: The folder has no such checkpoint. The message lists the existing steps, if there are any.
     """
     found = sorted(folder.glob("step-*.ckpt"))
     checkpoints = {number: path for path in found if (number := _step_of(path)) is not None}
@@ -158,8 +158,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is damaged, contains no Gaussians or is not a splatfacto checkpoint, or the step is invalid
-            or differs from the step in the file name.
+        ValueError: The file is damaged, contains no Gaussians or is not a splatfacto checkpoint. Also if the step is
+            invalid or differs from the step in the file name.
     """
     advice = "give another checkpoint with --load-step"
     loaded = load_torch_archive(path, "as ns-train splatfacto writes them", advice)

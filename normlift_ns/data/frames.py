@@ -212,8 +212,8 @@ def check_frames(frames: Sequence[Frame], source: Path) -> None:
     """Raise if the cameras of a camera file are not valid.
 
     Raises:
-        ValueError: The file has no cameras, a name occurs twice, a pose is not rigid, a number is not finite, or a
-            focal length or size is not positive. Also if only some of the cameras are fisheye cameras.
+        ValueError: The file has no cameras, a name occurs twice, or only some of the cameras are fisheye cameras. Also
+            if a pose is not rigid, a number is not finite, or a focal length or a size is not positive.
     """
     if len(frames) == 0:
         raise InputError(f"{source} has no cameras with images. Expected a camera for every training image.")

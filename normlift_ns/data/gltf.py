@@ -228,8 +228,10 @@ def _glb_chunks(path: Path) -> tuple[bytes, bytes]:
     with open_regular(path) as file:
         size = path.stat().st_size
         header = file.read(_HEADER.size)
-        if len(header) < _HEADER.size or _HEADER.unpack(header)[1] != 2 or _HEADER.unpack(header)[2] > size:
+        if len(header) < _HEADER.size or _HEADER.unpack(header)[2] > size:
             raise _damaged(path, f"its header does not match its {size:,} bytes")
+        if (version := _HEADER.unpack(header)[1]) != 2:
+            raise InputError(f"{path} has GLB version {version}, expected 2. Export glTF 2.0.")
         chunks = {}
         while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
             length, kind = _CHUNK.unpack(head)

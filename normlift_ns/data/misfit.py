@@ -20,8 +20,8 @@ _SIDES = (50, 100, 200)
 _HALVINGS, _MAX_MOVES = 2, 8
 """Number of halvings of the step for each image size, and maximum number of moves for each step."""
 _MIN_GAIN = 1.0
-"""Minimum gain in dB of a better lens. On a sharp scene, a focal length with an error of 2 % costs about 15 dB, so a
-gain of 1 dB is not due to chance."""
+"""Minimum gain in dB of a better lens. On a sharp scene, an error of 2 % in the focal length costs about 15 dB. A gain
+of 1 dB is therefore not due to chance."""
 _MIN_OVERLAP = 0.25
 """Minimum share of the pixels that can still be compared after a change of the lens."""
 

@@ -89,8 +89,8 @@ def validate_splat(splat: SplatParameters, file: Path) -> None:
     """Raise if a rasterizer cannot draw the Gaussians.
 
     Raises:
-        ValueError: The splat has no Gaussians, values are not finite, all rotations are zero, scales are not
-            logarithms, or opacities are not logits.
+        ValueError: The splat has no Gaussians, values are not finite, or all rotations are zero. Also if the scales are
+            probably not logarithms, or the opacities of 100 or more Gaussians are probably not logits.
     """
     if len(splat) == 0:
         raise InputError(f"{file} contains no Gaussians. Export the scene again.")
@@ -370,7 +370,8 @@ def check_ply_header(path: Path) -> None:
     """Raise if a PLY file is too small for the rows that its header declares, before memory is allocated for them.
 
     Raises:
-        ValueError: The header is invalid, is longer than 1 MiB, or declares more data than the file contains.
+        ValueError: The header is invalid, is longer than 1 MiB, has a line longer than 64 KiB, or declares more data
+            than the file contains.
     """
     size = path.stat().st_size
     with open_regular(path) as file:

@@ -236,8 +236,8 @@ def read_transforms(
         advice: Advice on missing images, for error messages.
     Raises:
         FileNotFoundError: The file, an image or a mask is missing.
-        ValueError: The file is not valid JSON, does not match the schema, has invalid or contradictory values, or has a
-            camera model that cannot be undistorted. Also if two images share a file.
+        ValueError: The file is not valid JSON, does not match the schema, or has invalid or contradictory values. Also
+            if a camera model cannot be undistorted, or two images share a file.
     """
     path = path / "transforms.json" if path.is_dir() else path
     entries = read_transforms_entries(path)
@@ -461,8 +461,8 @@ def _distortion(
     """Return the distortion parameters k1, k2, k3, p1, p2 and k4.
 
     Raises:
-        ValueError: A parameter that the camera type does not have is not zero, such as k4 of perspective cameras, or p1
-            and p2 of fisheye cameras.
+        ValueError: A parameter that the camera type does not have is not zero. Such parameters are k4 of perspective
+            cameras, p1 and p2 of fisheye cameras, and k5 and k6.
     """
     values = [getattr(entry, name) or 0.0 for name in DISTORTION]
     if entry.distortion_params is not None:
@@ -654,9 +654,9 @@ def gsplat_normalization(frames: Sequence[Frame], points: Float[np.ndarray, "n 3
         frames: All registered images, sorted by name.
         points: Points of the reconstruction, at least four.
     Returns:
-        The similarity of the trainer. The similarity of the actual training may differ by half a turn about an axis,
-        because the signs of the axes depend on the linear algebra library. Versions of gsplat before 1.5 do not flip
-        the points.
+        The similarity of the trainer. The similarity of the actual training may differ by half a turn about an axis.
+        The reason is that the signs of the axes depend on the linear algebra library. Versions of gsplat before 1.5 do
+        not flip the points.
     Raises:
         ValueError: The normalization cannot be computed, or the trainer's formula mirrors the world.
     """

@@ -36,8 +36,8 @@ _SCALES = 1.12 ** np.arange(-61, 62)
 _SHRINKING = (0.04, 0.02, 0.01)
 """Successive step sizes, in the logarithm of the scale, when points refine a scale."""
 _PARABOLAS, _MAX_MOVES = ((100, 0.01), (400, 0.001)), 5
-"""Longer side of the renders that refine a scale further, with the step between them in the logarithm of the scale;
-maximum number of these steps."""
+"""Longer side of the renders that refine a scale further, with the step between the logarithms of their scales; maximum
+number of these steps."""
 _MIN_START = 2.0
 """Minimum lead in dB of the PSNR of a first render over the PSNR of the mean color of its image."""
 _TURN, _TURNED_SIDE = math.radians(1), 200
@@ -240,7 +240,7 @@ def _draw_points(scene: SplatScene, views: Sequence[ReducedView]) -> _Points:
 
 
 def _is_best_nearby(scene: SplatScene, device: str) -> bool:
-    """Return True if the images fit worse after any rotation of the world by one degree about an axis.
+    """Return True if no rotation of the world by one degree about an axis improves the fit to the images.
 
     A world that is only close to the correct one can reach the usual PSNR, but one of the rotations improves its fit.
     """

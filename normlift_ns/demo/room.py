@@ -77,8 +77,8 @@ class Part(NamedTuple):
     """Number of Gaussians per square meter, relative to the walls."""
     shape: Distance
     paint: Callable[[Array], Array] | None = None
-    """Function that returns factors [n, 3] or [n, 1] by which to multiply the color of the class at points [n, 3]; None
-    for a plain color."""
+    """Function that returns factors [n, 3] or [n, 1] on the color of the class at points [n, 3]; None for a plain
+    color."""
     gloss: float = 0.0
     """Color value that is added where a highlight is brightest; 0 for a matte surface."""
 
@@ -123,7 +123,7 @@ def build_room(
         num_gaussians: Number of Gaussians, at least 2000.
         seed: Seed of the random numbers.
     Raises:
-        ValueError: If `num_gaussians` is too small.
+        ValueError: `num_gaussians` is less than 2000.
     """
     if num_gaussians < 2000:
         raise InputError(f"num_gaussians must be at least 2000 to cover the shapes, got {num_gaussians}")
@@ -396,7 +396,7 @@ def demo_room(num_gaussians: int = 45_000, seed: int = 0) -> DemoRoom:
         num_gaussians: Number of Gaussians, at least 2000.
         seed: Seed of the random numbers.
     Raises:
-        ValueError: If `num_gaussians` is too small.
+        ValueError: `num_gaussians` is less than 2000.
     """
     return build_room([*_walls(), *_furniture(), *_plant(), *_fruit()], _painted, _DETAILED_AREA, num_gaussians, seed)
 

@@ -213,7 +213,7 @@ def gourd(radius: float, height: float, ribs: int, furrow: float, dimple: float,
     """Return a flattened sphere with ribs and dimples at its poles, such as a tomato, an apple or a pumpkin.
 
     Args:
-        radius: Largest horizontal radius.
+        radius: Horizontal radius at half the height.
         height: Height without dimples.
         ribs: Number of ribs.
         furrow: Depth of the furrows between ribs, relative to `radius`.
@@ -311,7 +311,7 @@ def bottle(radius: float, height: float) -> Distance:
 
 
 def bowl(radius: float, thickness: float) -> Distance:
-    """Return a hemispherical bowl with a flat foot, open at the top."""
+    """Return a bowl in the shape of a spherical cap, with a flat foot and open at the top."""
 
     def distance(p: Array) -> Array:
         q = p - (0, 0, radius)

@@ -112,7 +112,7 @@ def _watch(processes: Sequence[subprocess.Popen[bytes]], log: Callable[[str], No
 
 
 def describe_signal(number: int) -> str:
-    """Return the name of a signal that killed a process, with a possible reason.
+    """Return the name of a signal that killed a process, with a possible reason for SIGKILL.
 
     >>> describe_signal(15)
     'SIGTERM'

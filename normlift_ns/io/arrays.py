@@ -250,8 +250,8 @@ def read_npy(path: Path, description: str) -> np.ndarray:
         description: Kind of file, for error messages.
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is not an NPY file, contains anything except booleans and real numbers of at most 64 bits,
-            or does not have the size that its header declares.
+        ValueError: The file is not an NPY file, or does not have the size that its header declares. Also if it contains
+            anything except booleans and real numbers of at most 64 bits.
     """
     if not os.path.isfile(path):
         if os.path.lexists(path):

@@ -454,7 +454,10 @@ def complete_interrupted_writes(folder: Path) -> None:
 
 @contextmanager
 def deferred_signals() -> Iterator[None]:
-    """Delay Ctrl-C and SIGTERM until the end of the `with` block, which must be short."""
+    """Delay Ctrl-C and SIGTERM until the end of the `with` block, which must be short.
+
+    Outside the main thread, which handles all signals, this has no effect.
+    """
     if threading.current_thread() is not threading.main_thread():  # only the main thread handles signals
         yield
         return

@@ -39,8 +39,8 @@ class RowArrays(NamedTuple):
             name: Name of the matrix, for the error message.
             num_columns: Number of columns of the matrix.
         Raises:
-            ValueError: An array has the wrong type or shape, the offsets are not valid, a column is out of range, or a
-                weight is negative or not finite.
+            ValueError: An array has the wrong type or shape, or the offsets are not valid. Also if a column is out of
+                range, or a weight is negative or not finite.
         """
         weight_dtype = "float64" if self.weight.dtype == "float64" else "float32"
         arrays = (("offsets", self.offsets, "int64"), ("columns", self.column, "int32"))

@@ -193,8 +193,7 @@ def written_files(run_dir: Path) -> set[str]:
     """Return the paths of the files that a lift wrote, relative to the run directory.
 
     They are config.yml, the manifest, the stored queries, and the files that the manifest lists. If the manifest is
-    missing, damaged or from version 0.1, the default names of all files that a lift writes are used instead of its
-    list.
+    missing, damaged or from version 0.1, the default names of all files that a lift writes replace its list.
     """
     names = {"config.yml", *(f"{FIELD_FOLDER}/{name}" for name in (MANIFEST_FILE, "queries.safetensors"))}
     try:

@@ -91,7 +91,7 @@ SPLATS = [
     ("--load-ply file --transforms dangling", "dangling (a broken link), given with --transforms"),
     ("--load-ply file --colmap room --masks none", "none, given with --masks"),
     ("--load-ply file --colmap room --timestamp old", "old exists", "--timestamp"),
-    ("--load-config room", "config room is a folder"),
+    ("--load-config room", "config room is not a file"),
     ("", "got 0"),
     ("--load-ply file --load-config config.yml", "got 2"),
     ("--load-ply file --colmap nowhere", "nowhere, given with --colmap"),

@@ -66,9 +66,9 @@ def test_what_is_no_cloud_is_refused(tmp_path):
     lists = f"{x}property float y\nproperty float z\nproperty list uchar int n\n"
     for content, message in (
         ("", "cannot be read"),
-        (f"{start}element vertex 1\n{x}{end}1\n", r"has 1 vertex with the properties x\."),
+        (f"{start}element vertex 1\n{x}{end}1\n", "vertices: 1, properties: x\\)"),
         (f"{start}element vertex 99999999999\n{x}{end}1\n", "truncated"),
-        (f"{start}element face 0\n{x}{end}", "0 vertices"),
+        (f"{start}element face 0\n{x}{end}", "vertices: 0, properties: none"),
         (f"{start}element vertex 1\n{lists}{end}1 2 3 1 4\n", "list properties"),
         (f"{start}element vertex 2\n{x}{end}1\n", "cannot be read"),
     ):

@@ -247,7 +247,7 @@ def test_other_files_are_refused(stock: StockRun, tmp_path: Path) -> None:
     for name in ("nowhere.yml", "folder.yml", "pipe.yml"):
         with pytest.raises(FileNotFoundError, match=name):
             read_trainer_config(tmp_path / name)
-    with pytest.raises(FileNotFoundError, match=f"but {stock.config} does"):
+    with pytest.raises(FileNotFoundError, match=f"is not a file; give {stock.config}"):
         read_trainer_config(stock.config.parent)
 
 

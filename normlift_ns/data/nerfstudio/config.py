@@ -46,7 +46,7 @@ def check_config_exists(path: Path, wrote: str = "ns-train") -> None:
         wrote: Command that writes such files, for the error message.
     """
     if not path.is_file():
-        problem = "is a folder, not a file" if path.is_dir() else "does not exist"
+        problem = "is not a file" if path.exists() else "does not exist"
         hint = f"; give {path / 'config.yml'}" if (path / "config.yml").is_file() else ""
         method = "splatfacto" if wrote == "ns-train" else "normlift"
         raise FileNotFoundError(
