@@ -122,7 +122,7 @@ def main(arguments: argparse.Namespace) -> None:
     rows = {cell: row for cell, row in finished(arguments.rows, run).items() if cell in set(cells)}
     spent = sum(row["seconds"] for row in rows.values())
     print(
-        f"{len(rows)} of {len(cells)} cells finished; {spent:.0f} s in cells so far, {time.time() - start:.0f} s in this call"
+        f"{len(rows)} of {len(cells)} cells finished; {spent:.0f} s in cells, {time.time() - start:.0f} s in this call"
     )
     if len(rows) == 0:
         sys.exit("no cell is finished; repeat the command, with more --minutes")
