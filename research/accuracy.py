@@ -203,7 +203,7 @@ def main(arguments: argparse.Namespace) -> None:
     scenes = [name for name in arguments.scenes if name == "demo" or not arguments.quick]
     expected = len(scenes) * len(steps_to_run(arguments.quick)) * seeds
     if len(rows) < expected:
-        sys.exit(f"{len(rows)} of {expected} observations are done; the same command goes on")
+        sys.exit(f"{len(rows)} of {expected} observations are finished; repeat the command to continue")
     report = Report("accuracy")
     report.add("voters", -1 if voters is None else voters, "Gaussians per scene that count; -1: all")
     report.add("seeds", seeds, "repeats")

@@ -151,7 +151,7 @@ def main(arguments: argparse.Namespace) -> None:
     wanted = set(wanted_rows(arguments, steps))
     rows = [row for row in rows if (row["scene"], row["step"], row["seed"]) in wanted]
     if len(rows) < len(wanted):
-        sys.exit(f"{len(rows)} of {len(wanted)} observations are done; the same command goes on")
+        sys.exit(f"{len(rows)} of {len(wanted)} observations are finished; repeat the command to continue")
     report = Report("consensus")
     report.add("voters", arguments.voters, "Gaussians per scene that vote and count for mIoU")
     report.add("seeds", arguments.seeds, f"repeats, from {FIRST_SEED} on")

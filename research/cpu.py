@@ -80,7 +80,7 @@ def warming() -> dict[str, float]:
     first, *kernels = child.stdout.split("\n")[:-1]
     rows = [line.split() for line in kernels]
     if any(misses != "0" for _, _, misses in rows):
-        raise RuntimeError(f"kernels were compiled again: {child.stdout}")
+        raise RuntimeError(f"a second process compiled kernels again, so the cache does not work: {child.stdout}")
     return {"import": float(first), **{name: float(seconds) for name, seconds, _ in rows}}
 
 

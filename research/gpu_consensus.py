@@ -75,7 +75,7 @@ def check(device: str, table: Callable[[int], Tensor]) -> dict[str, float]:
     here, there = (consensus(evidence.to(d), features.to(d)) for d in ("cpu", device))
     again = consensus(evidence.to(device), features.to(device))
     if not torch.equal(again.features, there.features) or again.agreement != there.agreement:
-        raise RuntimeError("another run gave other bits")
+        raise RuntimeError("a second run of the consensus gave different bits")
     return {
         "feature_error": float((there.features.cpu() - here.features).abs().max()),
         "agreement_error": abs(there.agreement[0] - here.agreement[0]),

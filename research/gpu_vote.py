@@ -126,7 +126,7 @@ def totals(room: Room) -> None:
 
 
 def stages(room: Room) -> None:
-    """Seconds of every stage of a vote, the GPU waited for between them."""
+    """Measure every stage of a vote; the CPU waits for the GPU after each stage."""
     seconds: dict[str, float] = defaultdict(float)
 
     def timer(stage: str, step: Callable[..., Any]) -> Callable[..., Any]:
@@ -230,7 +230,7 @@ def variants(room: Room, most: int = 2**17) -> None:
 
 
 def trees(room: Room) -> None:
-    """Seconds of the tree and of all neighbours by the size of nodes that are sorted each for itself."""
+    """Measure the tree and the search for all neighbors, by the largest size of nodes that are sorted separately."""
     for most in SORTED:
         with replaced(nearest, "_SORTED_IN_A_BLOCK", most):
             tree_s = timed(lambda: nearest.build_kd_tree(room.means))[0]

@@ -116,20 +116,22 @@ def main(arguments: argparse.Namespace) -> None:
     cells = cells_to_run(scenes, arguments.quick, real)
     rows = finished(arguments.rows, run := {"seeds": list(seeds), "candidates": names, **sizes})
     missing = [cell for cell in cells if cell not in rows]
-    print(f"{len(cells)} cells of {len(seeds)} seeds, {len(cells) - len(missing)} of them done before", flush=True)
+    print(f"{len(cells)} cells of {len(seeds)} seeds, {len(cells) - len(missing)} of them finished before", flush=True)
     deadline = start + 60 * arguments.minutes if arguments.minutes is not None else float("inf")
     run_all(missing, settings, seeds, arguments.rows, arguments.workers, deadline)
     rows = {cell: row for cell, row in finished(arguments.rows, run).items() if cell in set(cells)}
     spent = sum(row["seconds"] for row in rows.values())
-    print(f"{len(rows)} of {len(cells)} cells done, {spent:.0f} s in cells so far, {time.time() - start:.0f} s now")
+    print(
+        f"{len(rows)} of {len(cells)} cells finished; {spent:.0f} s in cells, {time.time() - start:.0f} s in this call"
+    )
     if len(rows) == 0:
-        sys.exit("no cell is done")
+        sys.exit("no cell is finished; repeat the command, with more --minutes")
     report = report_of(rows, names, len(cells), sizes, real=real)
     if len(rows) == len(cells) or arguments.report:
         report.write(arguments.output)
     show(report, names)
     if len(rows) < len(cells):
-        print("not a decision yet: the same command goes on")
+        print("There is no decision yet, because cells are missing. Repeat the command to continue.")
 
 
 if __name__ == "__main__":

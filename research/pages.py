@@ -66,9 +66,9 @@ def split(text: str, names: Collection[str]) -> list[Part]:
         if name is None and opened is None:
             raise MarkerError(f"line {number}: <!-- end --> without a table before it")
         if name is not None and opened is not None:
-            raise MarkerError(f"line {number}: table {name} begins before table {opened} has ended")
+            raise MarkerError(f"line {number}: table {name} starts before the end of table {opened}")
         if name is not None and name not in names:
-            raise MarkerError(f"line {number}: no table is called {name}; there are {', '.join(sorted(names))}")
+            raise MarkerError(f"line {number}: there is no table {name}; choose one of: {', '.join(sorted(names))}")
         if name is None:
             parts.append(Part("".join(lines), opened))
             lines = [line]

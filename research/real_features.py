@@ -34,21 +34,21 @@ class Cosines:
     """Means of cosines between features over pairs, with their keys in results/geometry.json in brackets."""
 
     two_things: float = 0.217
-    """Of two objects, in two views. [two_things.two_views]"""
+    """Cosine between two objects, in two views. [two_things.two_views]"""
     two_parts: float = 0.325
-    """Of two parts of an object, in two views. [thing.two_views]"""
+    """Cosine between two parts of an object, in two views. [thing.two_views]"""
     two_parts_one_view: float = 0.399
-    """Of two parts of an object, in one view. [thing.one_view]"""
+    """Cosine between two parts of an object, in one view. [thing.one_view]"""
     far: float = 0.390
-    """Of one part, from opposite directions. [far]"""
+    """Cosine between two views of one part, from opposite directions. [far]"""
     near: float = 0.770
-    """Of one part, from almost the same position. [near]"""
+    """Cosine between two views of one part, from almost the same position. [near]"""
     scale: float = 21.7
     """Angle between the views in degrees over which the cosine decays. [scale]"""
     own: float = 0.076
-    """Of a feature and its text. [own]"""
+    """Cosine between a feature and its text. [own]"""
     wrong: float = 0.045
-    """Of a feature and the best wrong text among 11. [wrong]"""
+    """Cosine between a feature and the best wrong text among 11. [wrong]"""
     spread: float = 0.382
     """Standard deviation of the cosine with the own text within an object, relative to this cosine. [spread]"""
 

@@ -192,7 +192,7 @@ def decide(rows: Rows, candidates: Sequence[str], limits: Limits = LIMITS) -> De
     """
     chosen_on = {cell: values for cell, values in rows.items() if cell.scene in CHOICE}
     if len(chosen_on) == 0 or "none" not in candidates:
-        raise ValueError(f"a decision needs cells of {' or '.join(CHOICE)} and the candidate none")
+        raise ValueError(f"a decision needs cells of {' or '.join(CHOICE)}, and the candidate none")
     verdicts = {name: verdict(chosen_on, name, limits) for name in candidates}
     choice = max((name for name in candidates if verdicts[name].eligible), key=lambda name: verdicts[name].mean)
     rooms = {room: {cell: values for cell, values in rows.items() if cell.scene == room} for room in CONFIRMATION}

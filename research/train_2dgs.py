@@ -36,7 +36,7 @@ CAPTURES = SHARED / "captures"
 
 
 def splat_options(name: str) -> SplatOptions:
-    """Return the cameras of a capture, in the world of its splatfacto run."""
+    """Return options that read the cameras of a capture in the world of its splatfacto run."""
     world = CAPTURES / "outputs" / name / "splatfacto" / "run" / "dataparser_transforms.json"
     return SplatOptions(
         transforms=CAPTURES / name / "transforms.json",

@@ -163,7 +163,7 @@ def until(page: Page, expression: str) -> None:
     deadline = time.monotonic() + PATIENCE
     while not page.evaluate(expression):
         if time.monotonic() > deadline:
-            raise TimeoutError(f"{expression}: never")
+            raise TimeoutError(f"after {PATIENCE} s, the page does not fulfill: {expression}")
         time.sleep(0.2)  # to look takes time from the renderer
 
 
@@ -222,7 +222,7 @@ def known_prompt(port: int, run: str, prompt: str, arrays: str) -> list[float]:
         content = answer.read()
         seconds.append(time.perf_counter() - start)
         if answer.status != 200:
-            raise RuntimeError(f"status {answer.status}: {content[:200]!r}")
+            raise RuntimeError(f"the server responded with status {answer.status}: {content[:200]!r}")
     line.close()
     return seconds[1:]
 

@@ -460,7 +460,7 @@ class RecordedVotes:
         return cached(restore_source(self.field.manifest), self.cache, compute=is_quick)
 
     def _check_regions(self, view: int, block: evidence_collection.ViewBatch) -> None:
-        """Raise if the regions of an image have changed since the lift."""
+        """Raise InputError if the regions of an image have changed since the lift."""
         if not isinstance(self.field.store, StoredEvidence):
             return  # the key of cached evidence includes the content of the regions
         expected = self.field.store.features[self.field.store.evidence.columns_of([view])]

@@ -157,7 +157,7 @@ def _quiet(transformers: Any) -> Iterator[None]:
 
 
 def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
-    """Return the parts of a config of a network, with only the entries that are sizes; raise InputError if invalid."""
+    """Return the parts of a network's config with only their sizes; raise InputError if one is invalid."""
     own = config if kind.config_key is None else config.get(kind.config_key)
     parts = {name: own.get(name) for name in kind.config_parts} if isinstance(own, Mapping) else {}
     for name, part in parts.items():

@@ -257,6 +257,8 @@ class RemoteRun:
 
         Raises:
             FileExistsError: The file exists and `overwrite` is False.
+            ValueError: The file belongs to a run, a data set or a cache, or the server rejects the request.
+            OSError: The file cannot be written, or the server does not respond.
         """
         path = check_path("path", path)
         refuse_inputs([path], instead="name")
