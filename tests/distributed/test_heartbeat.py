@@ -161,15 +161,12 @@ def test_where_the_store_is_gone_process_0_has_reported_its_error(world: World) 
     assert hearts[0].stop(well=False)
 
 
-def test_an_environment_that_cannot_be() -> None:
-    assert rank_and_world_size(ENVIRONMENT) == (1, 2)
+def test_an_environment_that_cannot_be_or_needs_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     assert rank_and_world_size(ENVIRONMENT | {"RANK": "0", "WORLD_SIZE": "1"}) is None
     for change in ({"RANK": "x"}, {"RANK": "2"}, {"RANK": "-1"}, {"WORLD_SIZE": "-1"}):
         with pytest.raises(InputError, match="torchrun"):
             rank_and_world_size(ENVIRONMENT | change)
 
-
-def test_processes_on_the_cpu_need_no_gpu_and_those_on_a_gpu_do(monkeypatch: pytest.MonkeyPatch) -> None:
     def connect(rank: int, size: int, backend: str, log: Any) -> Any:
         raise ConnectionError(f"{rank} of {size} by {backend}")
 
