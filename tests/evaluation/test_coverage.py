@@ -155,13 +155,10 @@ def test_gains_are_those_of_a_loop(monkeypatch):
         assert sum(x for _, x in chosen[:2]) >= 0.63 * best
 
 
-def test_everything_reliable_is_said():
+def test_everything_reliable_and_one_camera_are_said():
     scene = wall(held_out=NONE)
     found = coverage.coverage_of(scene, lifted(scene, list(range(8))))
     assert (found.regions, found.photographs, found.left_out, len(found.remarks)) == ([], [], {}, 2)
-
-
-def test_one_camera():
     scene = wall(train=Photographs(["0.png"], [looking((-3.0, -0.9, 0.2))]), held_out=NONE)
     found = coverage.coverage_of(scene, lifted(scene, [0]), min_reliability=0.6)
     n_eff = 1 / (1 + coverage.FAINT**2)
