@@ -108,14 +108,10 @@ def test_agreement_in_words():
     assert alone.to_json()["views"][0]["regions"][0]["weight"] == pytest.approx(0.7)
 
 
-@pytest.mark.usefixtures("unchecked")
-def test_selections_of_nothing_or_of_another_shape():
+def test_selections_of_nothing_or_of_another_shape(unchecked):
     evidence, features, _ = votes(0)
-    for wrong, hint in (
-        (torch.zeros(N, dtype=torch.bool), "nothing is selected"),
-        (torch.ones(N + 1, dtype=torch.bool), "30 booleans"),
-        (torch.ones(N), "30 booleans"),
-    ):
+    every = torch.ones(N, dtype=torch.bool)
+    for wrong, hint in ((~every, "nothing is selected"), (every[1:], "30 booleans"), (every.float(), "30 booleans")):
         with pytest.raises(InputError, match=hint):
             explain_selection(evidence, features, wrong)
 

@@ -14,6 +14,11 @@ from normlift_ns.demo.room import DemoRoom, demo_room, shade
 
 
 @pytest.fixture(scope="module")
+def room() -> DemoRoom:
+    return demo_room(6000)
+
+
+@pytest.fixture(scope="module")
 def labels(room: DemoRoom) -> list[torch.Tensor]:
     """True classes in the views of `demo_cameras(6, 160, 120)`."""
     return [view_labels(room, camera) for camera in demo_cameras(6, 160, 120)]
