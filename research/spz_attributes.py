@@ -20,11 +20,15 @@ from normlift_ns.data.spz import decode_spz, encode_spz
 from normlift_ns.exports import TrainedSplat, exportable_rows
 from tests.captures import SHARED
 from tests.data.scene_files import rows_of
-from tests.exports.test_captures import TEXTS
 
 SOURCE = nl.SourceOptions(encoder="color", regions="grid")
 LIFT = nl.LiftOptions(storage="evidence", max_views=6, lift_downscale=4)
 FOLDER = Path("outputs/spz_attributes")
+TEXTS = {
+    "fox": ("orange", "crimson", "gray"),
+    "tabletop": ("dusty red", "black", "white"),
+    "castle": ("sky blue", "dark green", "beige"),
+}
 
 
 def selected(splat: SplatParameters, name: str, options: nl.SplatOptions) -> Tensor:

@@ -44,15 +44,12 @@ def test_mistakes_of_the_user_are_told_as_they_are(state):
     assert not state.exists()
 
 
-def test_without_a_state_folder_the_temporary_one_is_taken(monkeypatch, tmp_path):
+def test_tracebacks_go_to_the_temporary_folder_or_are_printed(monkeypatch, tmp_path, capsys):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     log = log_traceback(raised(ValueError("x")))
     assert log is not None and log.parent == tmp_path
-
-
-def test_without_any_folder_the_traceback_is_printed(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("normlift_ns.errors._log_folders", lambda: [Path(os.devnull)])
     message, code = describe_error(raised(RuntimeError("first\nsecond" + "x" * 9999)))
     assert code == 70 and "bug" in message

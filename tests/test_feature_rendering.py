@@ -13,14 +13,11 @@ WIDTH, HEIGHT = 32, 32
 
 def two_layers() -> GaussianScene:
     axis = torch.linspace(-0.8, 0.8, 4, dtype=torch.float64)
-    x, y = (v.flatten() for v in torch.meshgrid(axis, axis, indexing="ij"))
-    front = torch.stack([x, y, torch.full_like(x, -0.5)], 1)
-    wall = torch.stack([x, y, torch.full_like(x, 0.5)], 1)
-    means = torch.cat([front[:8], wall])  # the sheet covers half of the wall
-    n = len(means)
-    opacities = torch.cat([torch.full((8,), 0.7), torch.full((16,), 0.9)]).double()
-    quaternions = torch.tensor([[1.0, 0, 0, 0]]).double().repeat(n, 1)
-    return GaussianScene(means, quaternions, torch.full((n, 3), 0.2).double(), opacities)
+    wall = torch.nn.functional.pad(torch.cartesian_prod(axis, axis), (0, 1), value=0.5)
+    means = torch.cat([wall[:8] * torch.tensor([1, 1, -1]), wall])  # the sheet covers half of the wall
+    quaternions = torch.tensor([[1.0, 0, 0, 0]]).double().repeat(24, 1)
+    opacities = torch.tensor([0.7] * 8 + [0.9] * 16).double()
+    return GaussianScene(means, quaternions, torch.full((24, 3), 0.2).double(), opacities)
 
 
 def test_least_squares_renders_better_and_leaves_the_sphere():

@@ -7,8 +7,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 import normlift_ns
 
 ROOT = Path(normlift_ns.__file__).parent
@@ -172,12 +170,3 @@ def test_help_and_mistakes_load_nothing_heavy_nor_does_a_lift_load_what_it_does_
     done = subprocess.run([sys.executable, "-c", STAGES], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr and done.stderr.count("Error\n") == 9
-
-
-def test_public_names_exist_and_have_docstrings_with_examples():
-    assert set(normlift_ns.__all__) <= set(dir(normlift_ns))
-    for name in normlift_ns.__all__:
-        member = getattr(normlift_ns, name)
-        assert isinstance(member, tuple) or ">>>" in member.__doc__, name
-    with pytest.raises(AttributeError, match="nothing"):
-        _ = normlift_ns.nothing

@@ -162,9 +162,8 @@ def test_more_neighbours_than_there_are_and_a_reach_that_cannot_be():
     for k, message in ((100_000, "k must be at most 1,024, got 100,000"), (0, "k .* 0")):
         with pytest.raises(InputError, match=message):
             nearest_neighbors(means, k)
-    for max_gap in (math.nan, math.inf, 0.0, -1.0):
-        with pytest.raises(InputError, match="object_max_gap must be"):
-            connected_components(means, means[:, 0] >= 0, max_gap=max_gap)
+    with pytest.raises(InputError, match="object_max_gap must be"):
+        connected_components(means, means[:, 0] >= 0, max_gap=0.0)
     assert check_number("object_max_gap", 4) == 4.0
 
 

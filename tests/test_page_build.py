@@ -33,10 +33,8 @@ def backend(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
 
 def programs(folder: Path, version: str, result: str = "") -> Path:
     (folder / "bin").mkdir(exist_ok=True)
-    texts = {
-        "node": f"#!/bin/sh\necho {version}\n",
-        "npm": NPM.format(log=folder / "log", page=folder / "page", result=result),
-    }
+    npm = NPM.format(log=folder / "log", page=folder / "page", result=result)
+    texts = {"node": f"#!/bin/sh\necho {version}\n", "npm": npm}
     for name, text in texts.items():
         (folder / "bin" / name).write_text(text.replace("mkdir", "/bin/mkdir"))
         (folder / "bin" / name).chmod(0o755)

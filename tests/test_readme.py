@@ -166,6 +166,18 @@ def test_times_of_the_readme_and_of_front_ends_are_those_of_the_results():
     ) in " ".join(FRONT_ENDS.split())
 
 
+def test_tables_of_the_pages_are_those_of_the_results_and_every_table_stands_on_one():
+    from research import pages  # noqa: PLC0415 (scikit-image, matplotlib)
+
+    made, shown = pages.tables(pages.documents()), set()
+    for name in pages.PAGES:
+        text = (ROOT / name).read_bytes().decode()
+        assert pages.outdated(text, made) == [], "refresh them: python -m research.pages"
+        assert pages.refreshed(text, made) == text
+        shown |= {part.table for part in pages.split(text, made)}
+    assert shown == {None, *made}
+
+
 def test_messages_of_troubleshooting_are_in_the_code():
     code = "".join(path.read_text("utf8") for path in sorted((ROOT / "normlift_ns").rglob("*.py")))
     code = re.sub(r'"\n\s*f?"', "", code)

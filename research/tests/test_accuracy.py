@@ -1,6 +1,5 @@
 """The controlled benchmark: what damage is, that no damage is none, and that its shortcuts are exact."""
 
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -24,6 +23,7 @@ from research.report import RESULTS, Report
 from research.synthetic_scenes import PARTS, made_words
 from research.tests import ROOT, quick
 from research.tests.tiny import CLASSES, WORDS
+from tests.processes import run
 from tests.random_scenes import dense, generator
 
 
@@ -155,8 +155,7 @@ def test_votes_are_those_of_refine(world):
 def test_quick_grid(tmp_path):
     flags = ("--rows", str(tmp_path / "rows.jsonl"))
     command = [sys.executable, "-m", "research.grid", "--quick", *flags, "--minutes", "0"]
-    begun = subprocess.run([*command, "--output", tmp_path], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert begun.returncode == 1 and "no cell is done" in begun.stderr
+    assert "no cell is done" in run(*command, "--output", tmp_path, code=1, cwd=ROOT)
     values = quick("grid", tmp_path, *flags)
     assert values["cells"]["value"] == 12 and any(key.startswith("decision.default.") for key in values)
     assert quick("grid", tmp_path, *flags) == values  # from the rows

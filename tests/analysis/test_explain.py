@@ -108,14 +108,10 @@ def test_agreement_in_words():
     assert alone.to_json()["views"][0]["regions"][0]["weight"] == pytest.approx(0.7)
 
 
-@pytest.mark.usefixtures("unchecked")
-def test_selections_of_nothing_or_of_another_shape():
+def test_selections_of_nothing_or_of_another_shape(unchecked):
     evidence, features, _ = votes(0)
-    for wrong, hint in (
-        (torch.zeros(N, dtype=torch.bool), "nothing is selected"),
-        (torch.ones(N + 1, dtype=torch.bool), "30 booleans"),
-        (torch.ones(N), "30 booleans"),
-    ):
+    every = torch.ones(N, dtype=torch.bool)
+    for wrong, hint in ((~every, "nothing is selected"), (every[1:], "30 booleans"), (every.float(), "30 booleans")):
         with pytest.raises(InputError, match=hint):
             explain_selection(evidence, features, wrong)
 
@@ -128,9 +124,7 @@ def test_an_outline_lies_within_and_around_its_region():
     shown = draw_outlines(image, masks)
     line = (shown == torch.tensor([255, 176, 0], dtype=torch.uint8)).all(dim=2)
     assert bool(masks.any(0)[line].all())
-    assert line[50:52, 100:300].all()  # two pixels wide at 640
-    assert not line[52:98, 102:298].any()
+    assert line[50:52, 100:300].all() and not line[52:98, 102:298].any()  # two pixels wide at 640
     assert line[198:, :50].all()
-    assert (shown[75, 200] == 100).all()
-    assert (shown[10, 10] == 45).all()
+    assert (shown[75, 200] == 100).all() and (shown[10, 10] == 45).all()
     assert torch.equal(draw_outlines(image, masks[:0]), torch.full_like(image, 45))

@@ -87,12 +87,10 @@ def test_an_answer_has_the_threshold_that_it_was_given(tmp_path):
 
 def test_a_text_that_most_of_the_scene_is_selects_it_and_limits_go_by_the_lead():
     lerf, margin = (RELEVANCY_RULES[rule].presence_limit for rule in ("lerf", "margin"))
-    assert margin is not None
-    assert 1 / (1 + np.exp(-10 * margin)) == pytest.approx(lerf, abs=1e-12)
+    assert margin is not None and 1 / (1 + np.exp(-10 * margin)) == pytest.approx(lerf, abs=1e-12)
     values = np.repeat([0.2, 0.9, 0.9 + 1e-9], [30, 60, 10])
     found = relevancy_histogram(values, np.ones(100, bool), 0.5, RANGE)
-    assert found is not None
-    assert 0.4 < found.suggested < 0.8
+    assert found is not None and 0.4 < found.suggested < 0.8
     assert suggest_threshold(values[:, None], np.ones(100, bool), RANGE) == pytest.approx(found.suggested)
     assert int((values > found.suggested).sum()) == 70
 
@@ -103,6 +101,5 @@ def test_a_suggestion_separates_an_object_of_any_size_from_what_is_alike(size: i
     alike, other = rng.normal(0.35, 0.05, count // 5), rng.normal(0.1, 0.08, count)
     values = np.concatenate([rng.normal(0.8, 0.04, size), alike, other])
     suggested = suggest_threshold(values[:, None], np.ones(len(values), bool), RANGE)
-    assert suggested is not None
-    assert (values[:size] > suggested).mean() > 0.95
+    assert suggested is not None and (values[:size] > suggested).mean() > 0.95
     assert (values[size:] > suggested).sum() < 0.05 * size

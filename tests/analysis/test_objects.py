@@ -41,13 +41,12 @@ def test_only_what_is_selected_connects():
 
 
 def test_parts_smaller_than_one_gaussian_are_refused():
+    means, every = torch.rand(4, 3), torch.ones(4, 1)
     for min_size in (0, 1.5):
         with pytest.raises(InputError, match="object_min_gaussians"):
-            objects.find_objects(None, torch.rand(4, 3), torch.ones(4, dtype=torch.bool), min_gaussians=min_size)
+            objects.find_objects(None, means, every[:, 0] > 0, min_gaussians=min_size)
         with pytest.raises(InputError, match="object_min_gaussians"):
-            objects.find_instances(
-                ("a",), torch.rand(4, 3), torch.ones(4, 1), torch.ones(4, 1) > 0, min_gaussians=min_size
-            )
+            objects.find_instances(("a",), means, every, every > 0, min_gaussians=min_size)
 
 
 def test_further_prompts_change_no_number_of_an_object():

@@ -14,6 +14,11 @@ from normlift_ns.demo.room import DemoRoom, demo_room, shade
 
 
 @pytest.fixture(scope="module")
+def room() -> DemoRoom:
+    return demo_room(6000)
+
+
+@pytest.fixture(scope="module")
 def labels(room: DemoRoom) -> list[torch.Tensor]:
     """True classes in the views of `demo_cameras(6, 160, 120)`."""
     return [view_labels(room, camera) for camera in demo_cameras(6, 160, 120)]
@@ -37,13 +42,11 @@ def test_contents(room: DemoRoom):
     assert bool(room.scene.drawable.all())
     counts = torch.bincount(room.labels + 1)
     assert len(counts) == len(room.names) + 1 == 14
-    assert counts[0] == 120  # floaters
-    assert counts[1:].min() > 60
+    assert counts[0] == 120 and counts[1:].min() > 60  # the first are floaters
     assert room.colors.min() >= 0 and room.colors.max() <= 1
     shape = torch.cat([room.scene.means, room.scene.scales, room.scene.quats.abs(), room.colors], dim=1).double()
     assert float(shape.std(dim=0).sum()) == pytest.approx(3.608499, rel=1e-5)  # as recorded
-    never_drawn = (room.scene.opacities < 1 / 255).float().mean().item()
-    assert 0.02 < never_drawn < 0.06
+    assert 0.02 < float((room.scene.opacities < 1 / 255).float().mean()) < 0.06
     with pytest.raises(ValueError, match=r"2000.*1999"):
         demo_room(1999)
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from torch.distributed import HashStore
 
 from normlift_ns.distributed import heartbeat, launch
 from normlift_ns.distributed.heartbeat import HEARTBEAT_TIMEOUT, Heartbeat, PeerFailure
@@ -18,30 +19,15 @@ from normlift_ns.errors import InputError
 ENVIRONMENT = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
 
 
-class Store:
-    """A store in a dictionary, as torch's is."""
+class Store(HashStore):
+    """A store of one process, which can be gone."""
 
-    def __init__(self) -> None:
-        self.values: dict[str, bytes] = {}
-        self.gone = False
+    gone = False
 
     def set(self, key: str, value: str) -> None:
         if self.gone:
             raise RuntimeError("Broken pipe")
-        self.values[key] = value.encode()
-
-    def get(self, key: str) -> bytes:
-        return self.values[key]
-
-    def check(self, keys: list[str]) -> bool:
-        return all(key in self.values for key in keys)
-
-    def add(self, key: str, more: int) -> int:
-        self.values[key] = str(int(self.values.get(key, b"0")) + more).encode()
-        return int(self.values[key])
-
-    def wait(self, keys: list[str], patience: Any) -> None:
-        until(lambda: self.check(keys))
+        super().set(key, value)
 
 
 def until(found: Callable[[], bool]) -> None:
@@ -81,8 +67,8 @@ class World:
         self.now += seconds
         for _ in range(2):
             alive = [f"beat/{one.rank}" for one in self.hearts if not one._stop.is_set() and one.failure is None]
-            before = {key: self.store.values.get(key) for key in alive}
-            until(lambda before=before: all(self.store.values.get(key) != beat for key, beat in before.items()))
+            before = {key: self.store.get(key) for key in alive}
+            until(lambda before=before: all(self.store.get(key) != beat for key, beat in before.items()))
 
 
 @pytest.fixture
@@ -137,7 +123,7 @@ def test_a_process_that_does_not_wait_is_asked_to_end_and_then_ended(world: Worl
     monkeypatch.setattr(heartbeat, "_GRACE", 0.01)
     world.team(2)
     world.kill(1)
-    world.store.values["end/1"] = b"failed"
+    world.store.set("end/1", "failed")
     until(lambda: len(world.exits) > 0)
     assert (world.signals, world.exits) == ([15], [1])
     assert [(lost.rank, lost.reported) for lost in world.words] == [(1, True)]
@@ -161,15 +147,12 @@ def test_where_the_store_is_gone_process_0_has_reported_its_error(world: World) 
     assert hearts[0].stop(well=False)
 
 
-def test_an_environment_that_cannot_be() -> None:
-    assert rank_and_world_size(ENVIRONMENT) == (1, 2)
+def test_an_environment_that_cannot_be_or_needs_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     assert rank_and_world_size(ENVIRONMENT | {"RANK": "0", "WORLD_SIZE": "1"}) is None
     for change in ({"RANK": "x"}, {"RANK": "2"}, {"RANK": "-1"}, {"WORLD_SIZE": "-1"}):
         with pytest.raises(InputError, match="torchrun"):
             rank_and_world_size(ENVIRONMENT | change)
 
-
-def test_processes_on_the_cpu_need_no_gpu_and_those_on_a_gpu_do(monkeypatch: pytest.MonkeyPatch) -> None:
     def connect(rank: int, size: int, backend: str, log: Any) -> Any:
         raise ConnectionError(f"{rank} of {size} by {backend}")
 

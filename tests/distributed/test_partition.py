@@ -119,8 +119,7 @@ def test_the_field_is_the_same(vote: str, storage: Storage, seed: int) -> None:
     assert float((expected.source != torch.arange(N)).float().mean()) > 0.1
     for size in (1, 2, 13):  # of which some have nothing
         found, *others = together(size, lambda team: lifted_by(team, seed, vote, storage))
-        assert others == [None] * (size - 1)
-        assert found is not None
+        assert others == [None] * (size - 1) and found is not None
         assert found.manifest == expected.manifest
         assert torch.equal(found.source, expected.source)
         for field in fields(Scalars):

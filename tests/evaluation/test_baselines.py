@@ -97,6 +97,10 @@ def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
 def test_ideas_are_their_sums_over_pixels(lifted, monkeypatch):
     monkeypatch.setattr("normlift_ns.evaluation.baselines._BLOCK", 60)
     seen, methods = observations(lifted), (sfs, occam, vala, drsplat)
+    every = list(map(id, lifted.scene.train.cameras))
+    assert [every.index(id(camera)) for camera, *_ in seen] == [0, 1, 3, 4]  # those of the lift
+    few = [camera for block in baselines.lifted_batches(lifted, "cpu", max_views=2) for camera in block.cameras]
+    assert [every.index(id(camera)) for camera in few] == [0, 4]
     assert {method.__name__ for method in methods} == set(baselines.BASELINES)
     for method in methods:
         field = baselines.baseline_field(method.__name__, lifted, "cpu")
@@ -111,14 +115,6 @@ def test_ideas_are_their_sums_over_pixels(lifted, monkeypatch):
         assert (cosine > 1 - 1e-5).float().mean() > 0.95, method
         plain = lifted.field.directions(refined=False).double()
         assert ((plain * expected).sum(1)[valid] < 1 - 1e-4).float().mean() > 0.1, method  # another method
-
-
-def test_the_views_are_those_of_the_lift(lifted):
-    cameras = [camera for block in baselines.lifted_batches(lifted, "cpu") for camera in block.cameras]
-    every = list(map(id, lifted.scene.train.cameras))
-    assert [every.index(id(camera)) for camera in cameras] == [0, 1, 3, 4]
-    few = [camera for block in baselines.lifted_batches(lifted, "cpu", max_views=2) for camera in block.cameras]
-    assert [every.index(id(camera)) for camera in few] == [0, 4]
 
 
 def changed(lifted: EvaluatedRun, **facts: Any) -> EvaluatedRun:

@@ -12,6 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from normlift_ns import Camera, GaussianScene, SemanticField, lift, rasterize_evidence
+from normlift_ns.core.gaussians import facing_pose
 from normlift_ns.core.scene import camera_summary
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
@@ -23,12 +24,7 @@ NONE = Photographs([], [])
 
 
 def looking(eye: tuple[float, float, float], target=(0.0, 0.0, 0.0), width=64, height=48) -> Camera:
-    eye_, target_ = torch.tensor(eye).double(), torch.tensor(target).double()
-    forward = torch.nn.functional.normalize(target_ - eye_, dim=0)
-    right = torch.nn.functional.normalize(forward.cross(torch.tensor([0.0, 0, 1]).double(), dim=0), dim=0)
-    pose = torch.eye(4).double()
-    pose[:3, :3] = torch.stack([right, forward.cross(right, dim=0), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye_
+    pose = facing_pose(*(torch.tensor(x).double() for x in (eye, target, (0.0, 0.0, 1.0))))
     K = torch.tensor([[width * 0.6, 0, width / 2], [0, width * 0.6, height / 2], [0, 0, 1]])
     return Camera(K, pose.float(), width, height)
 
@@ -159,13 +155,10 @@ def test_gains_are_those_of_a_loop(monkeypatch):
         assert sum(x for _, x in chosen[:2]) >= 0.63 * best
 
 
-def test_everything_reliable_is_said():
+def test_everything_reliable_and_one_camera_are_said():
     scene = wall(held_out=NONE)
     found = coverage.coverage_of(scene, lifted(scene, list(range(8))))
     assert (found.regions, found.photographs, found.left_out, len(found.remarks)) == ([], [], {}, 2)
-
-
-def test_one_camera():
     scene = wall(train=Photographs(["0.png"], [looking((-3.0, -0.9, 0.2))]), held_out=NONE)
     found = coverage.coverage_of(scene, lifted(scene, [0]), min_reliability=0.6)
     n_eff = 1 / (1 + coverage.FAINT**2)

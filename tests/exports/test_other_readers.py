@@ -19,6 +19,7 @@ from normlift_ns.data.splat import SplatParameters, read_ply
 from normlift_ns.rasterization.projection import rotation_matrices
 from tests.data.scene_files import ply_columns, random_splat, rows_of, write_ply
 from tests.data.test_compressed_formats import write_any
+from tests.processes import run
 
 pytestmark = pytest.mark.slow
 PACKAGES = ("@playcanvas/splat-transform@3.7.0", "gltf-validator@2.0.0-dev.3.10", "three@0.187.0")
@@ -70,14 +71,12 @@ def node(made_once: Callable[..., Path]) -> Callable[..., str]:
 
     folder = made_once("npm", install)
 
-    def run(*words: object, ends: int = 0) -> str:
+    def run_node(*words: object) -> str:
         script = folder / "node_modules/@playcanvas/splat-transform/bin/cli.mjs" if words[0] == "-w" else ""
-        given = [program, str(script), *words] if script else [program, str(folder / str(words[0])), *words[1:]]
-        done = subprocess.run(list(map(str, given)), capture_output=True, text=True, timeout=170, check=False)
-        assert done.returncode == ends, done.stdout[-500:] + done.stderr[-500:]
-        return done.stdout
+        given = (script, *words) if script else (folder / str(words[0]), *words[1:])
+        return run(program, *given, timeout=170)
 
-    return run
+    return run_node
 
 
 def close(found: SplatParameters, expected: SplatParameters, limit: float) -> None:

@@ -27,13 +27,6 @@ def own_evidence(reliability: torch.Tensor) -> torch.Tensor:
     return torch.where(reliability > 0, views.to(reliability), 0.0)
 
 
-def numbers(config: RefineConfig, neighbors: Neighbors) -> dict[str, float]:
-    """The parameters as `vote` takes them."""
-    found = config.numbers
-    width = float(decay_width(neighbors.spacing, config))
-    return {"tau": found.tau, "gamma": found.gamma, "width": width, "delta": found.delta}
-
-
 def cast(neighbors: Neighbors, directions, reliability, config: RefineConfig, voters=None, **options: Any):
     """The winners of the first voters or of all, with `own_evidence` in a posterior vote; -1 if unwritten."""
     n = len(reliability)
@@ -42,7 +35,9 @@ def cast(neighbors: Neighbors, directions, reliability, config: RefineConfig, vo
     arrays = (every.long()[:voters], neighbors.index, neighbors.distance, directions, every, reliability)
     if config.vote == "posterior":
         options = {"own": own_evidence(reliability).to(DEVICE), "prior": config.prior, **options}
-    vote(*(x.to(DEVICE) for x in arrays), source, **numbers(config, neighbors), **options)
+    found, width = config.numbers, float(decay_width(neighbors.spacing, config))
+    shape = {"tau": found.tau, "gamma": found.gamma, "width": width, "delta": found.delta}
+    vote(*(x.to(DEVICE) for x in arrays), source, **shape, **options)
     return source.cpu()
 
 
@@ -167,6 +162,7 @@ def test_ties_go_to_the_nearer():
     for precision in ("certified", "halves", "tf32x3"):
         found = cast(neighbors, u, r, RefineConfig(k=5), precision=precision)
         assert found.tolist() == [3, 3, 3, 3, 4, 3], precision
+        assert cast(neighbors, u, r, RefineConfig(k=5), 0, precision=precision).tolist() == [-1] * 6
 
 
 def test_members_and_their_reliability():

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 import torch
 
-from normlift_ns import Camera, InputError, RasterSettings, lift, nearest_neighbors, rasterize_evidence, refine, render
+from normlift_ns import Camera, InputError, RasterSettings, nearest_neighbors, rasterize_evidence, render
 from normlift_ns.core import device
 from normlift_ns.rasterization import gsplat, rasterize, triton
 from normlift_ns.rasterization.rasterize import RasterJob
 from tests.captures import SHARED, needs_shared, trained_scene, training_cameras, weight_fixtures
 from tests.kernels.test_regions import hard_scene
-from tests.random_scenes import dense, generator, orbit, random_labels, random_scene, unit_rows
+from tests.random_scenes import dense, generator, orbit, random_labels, random_scene
 from tests.rasterization.test_gsplat_fixtures import weight_errors
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: the kernels cannot run")
@@ -223,30 +223,6 @@ def test_pictures_are_those_of_the_reference(channels, backend):
         assert ours.shape == theirs.shape
         if channels > 0:
             assert (ours - theirs).norm() <= 1e-4 * theirs.norm()
-
-
-@needs_gpu
-def test_the_whole_lift_equals_that_of_the_cpu():
-    scene, cameras = (
-        random_scene(4000, seed=2, dtype=torch.float32, size=0.05),
-        orbit(4, width=160, height=120, focal=150),
-    )
-    labels = [random_labels(camera, 9, seed=v) for v, camera in enumerate(cameras)]
-    table = unit_rows(36, 512, 1, torch.float32)
-    results = []
-    for place in ("cpu", "cuda"):
-        there = scene.to(place)
-        lifted = lift(rasterize_evidence(there, cameras, labels, num_regions=[9] * 4), table.to(place))
-        neighbors = nearest_neighbors(there.means, 36)
-        given = {"own": lifted.scalars.own_evidence, "neighbors": neighbors}
-        source = refine(there.means, lifted.directions, lifted.scalars.reliability, **given)
-        results.append(
-            [x.cpu() for x in (lifted.scalars.reliability, neighbors.index, lifted.directions(source.long()))]
-        )
-    (reliability, index, refined), (reliability_gpu, index_gpu, refined_gpu) = results
-    assert (reliability - reliability_gpu).abs().max() < 1e-4
-    assert torch.equal(index, index_gpu)
-    assert ((refined - refined_gpu).norm(dim=1) > 1e-3).float().mean() < 0.01
 
 
 @needs_gpu

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +17,9 @@ from normlift_ns.rasterization import numba as backend
 from normlift_ns.rasterization.numba import cached_njit
 from normlift_ns.rasterization.projection import assign_tiles
 from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
+from tests.processes import run
 from tests.random_scenes import dense, generator, orbit_camera, random_labels, random_scene
 
-DTYPES = [torch.float32, torch.float64]
 SETTINGS = RasterSettings()
 
 
@@ -112,7 +111,7 @@ def test_exp_is_exact_to_the_last_bits(dtype, bound):
     assert np.abs(found / np.exp(x.astype(np.longdouble)) - 1)[3:].max() < bound
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_what_is_warmed_is_what_is_called(dtype):
     """A call after `warm` finds every kernel with its types: it adds no signature."""
     backend.compile_kernels(dtype).join()
@@ -143,9 +142,7 @@ def test_a_second_process_compiles_nothing_even_beside_code_that_cannot_be_writt
     """
 
     def hits_and_misses(first_kernel: int) -> tuple[str, Path]:
-        words = [sys.executable, "-c", CHILD, str(first_kernel)]
-        done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
-        counts, path = done.stdout.split("\n")[:2]
+        counts, path = run(sys.executable, "-c", CHILD, first_kernel, cwd=tmp_path, env=environment).split("\n")[:2]
         return counts, Path(path)
 
     environment = {**os.environ, "PYTHONPATH": str(Path(normlift_ns.__file__).parents[1])}

@@ -65,14 +65,11 @@ def test_the_outline_goes_around_what_is_selected_and_the_photograph_stands_besi
     rows, columns = np.nonzero(inside)
     found = inside[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     assert found.shape == (480, 640)
-    line = ~found
-    rows, columns = np.nonzero(line)
-    assert abs(rows.min() - 160) <= 4 and abs(rows.max() - 319) <= 4
-    assert abs(columns.min() - 160) <= 4 and abs(columns.max() - 479) <= 4
-    assert found[240, 320] and 3 * 900 < line.sum() < 7 * 1100  # a closed line of 3 to 7 pixels
-    none = np.asarray(
-        figures.view_figure(SHEET, figures.FigureHeader("x", "y"), "0001", None, overlay, ~selected & selected)
-    )
+    ends = np.array([(x.min(), x.max()) for x in np.nonzero(~found)])
+    assert (abs(ends - [[160, 319], [160, 479]]) <= 4).all()
+    assert found[240, 320] and 3 * 900 < (~found).sum() < 7 * 1100  # a closed line of 3 to 7 pixels
+    nothing = torch.zeros_like(selected)
+    none = np.asarray(figures.view_figure(SHEET, figures.FigureHeader("x", "y"), "0001", None, overlay, nothing))
     assert (none == blue.numpy()).all(axis=2).sum() == 640 * 480
 
 
@@ -92,14 +89,9 @@ def test_the_title_says_how_much_and_on_what_evidence() -> None:
         assert figures.FigureHeader.of(finding).title.split("   ·   ") == ["x", verdict][: 1 + (verdict is not None)]
 
 
-def pictured() -> tuple[torch.Tensor, torch.Tensor]:
-    rgb = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0))
-    return rgb, rgb.mean(dim=2, keepdim=True).expand_as(rgb)
-
-
-def test_the_overlay_colours_the_selection_by_a_fixed_scale() -> None:
-    rgb, grey = pictured()
-    colors = colormap_rgb("viridis")
+def test_overlay_segmentation_and_reliability_have_colours_of_their_own() -> None:
+    rgb, colors = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0)), colormap_rgb("viridis")
+    grey = rgb.mean(dim=2, keepdim=True).expand_as(rgb)
     relevancy, share = torch.zeros(4, 5), torch.zeros(4, 5, 1)
     relevancy[0] = torch.tensor([-1.0, 0.5, 0.75, 1.0, 7.0])
     share[0] = 1
@@ -111,18 +103,13 @@ def test_the_overlay_colours_the_selection_by_a_fixed_scale() -> None:
     torch.testing.assert_close(found[1, 0], 0.55 * grey[1, 0] + 0.45 * colors[255])
     torch.testing.assert_close(found[2:], grey[2:])
 
-
-def test_segmentation_and_reliability_have_colours_of_their_own() -> None:
-    rgb, grey = pictured()
-    colors = prompt_colors(["a", "b", "c"])
-    labels = torch.arange(20).reshape(4, 5) % 3
+    colors, labels = prompt_colors(["a", "b", "c"]), torch.arange(20).reshape(4, 5) % 3
     found = segmentation(rgb, labels, torch.ones(4, 5, 1), colors)
     torch.testing.assert_close(found, 0.2 * grey + 0.8 * colors[labels])
     torch.testing.assert_close(segmentation(rgb, labels, torch.zeros(4, 5, 1), colors), grey)
-    colors, alpha = colormap_rgb("cividis"), torch.full((4, 5), 0.5)
-    reliability = torch.full((4, 5, 1), 0.25)  # composited: R is 0.5
-    found = reliability_map(rgb, reliability, alpha)
-    torch.testing.assert_close(found, 0.55 * grey + 0.45 * colors[128].expand(4, 5, 3))
+    reliability, alpha = torch.full((4, 5, 1), 0.25), torch.full((4, 5), 0.5)  # composited: R is 0.5
+    expected = 0.55 * grey + 0.45 * colormap_rgb("cividis")[128].expand(4, 5, 3)
+    torch.testing.assert_close(reliability_map(rgb, reliability, alpha), expected)
     assert torch.equal(reliability_map(rgb, 0 * reliability, 0 * alpha), grey)
 
 

@@ -29,16 +29,11 @@ _CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.chmod", "shuti
 class Job:
     """A command, and when it is to be killed."""
 
-    words: tuple[str, ...]
-    """`lift`, `query` or `export` with flags; `room` with a folder."""
-    log: str
-    """File of all that it prints."""
-    folder: str = ""
-    """Where accesses that change something are counted."""
-    step: int | None = None
-    """Kill before this access."""
-    seconds: float | None = None
-    """Kill after so many."""
+    words: tuple[str, ...]  # `lift`, `query` or `export` with flags; `room` with a folder
+    log: str  # the file of all that it prints
+    folder: str = ""  # in which accesses that change something are counted
+    step: int | None = None  # before this access
+    seconds: float | None = None  # or after so many
     signal: int = signal.SIGKILL
 
 
