@@ -42,6 +42,7 @@ def test_what_is_not_a_similarity_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "world.json"
     for content, message in (
         (np.diag([1.0, 1, -1, 1]).tolist(), "similarity"),
+        (np.diag([1.0, 1, 2, 1]).tolist(), "similarity"),
         (np.zeros((4, 4)).tolist(), "similarity"),
         ([[1, 2], [3, 4]], r"shape \(2, 2\)"),
         ("eye", "does not contain a transform"),

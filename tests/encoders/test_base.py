@@ -17,6 +17,7 @@ def test_view_features_accept_what_fits_and_refuse_the_rest():
     none = torch.zeros(2, 2, dtype=torch.int32)
     for labels, features, parts in (
         (none.float(), UNIT, ["labels", "torch.int32"]),
+        (none.flatten(), UNIT, ["labels", "torch.int32"]),
         (none, UNIT.double(), ["features", "torch.float32"]),
         (none + 2, UNIT, ["-1..1", "number of cells: 2", "2..2"]),
         (none - 2, UNIT, ["-2..-2"]),
