@@ -53,9 +53,6 @@ def test_batches_are_filled_from_several_parts(counts, size):
         assert first[len(asked) - 1] < first[i] + counts[i] + size  # no part is asked for without need
     assert asked == list(range(len(counts)))
     assert sizes == [size] * -(-sum(counts) // size)
-
-
-def test_what_never_fits_other_errors_and_no_items():
     with pytest.raises(MemoryError, match=r"CUDA out of memory.*2 GiB.*--lift-downscale 2"):
         list(AdaptiveBatches(16)(narrow(0)[0], torch.arange(10)))
     with pytest.raises(ZeroDivisionError):
@@ -72,6 +69,11 @@ def test_results_come_in_the_order_of_their_items() -> None:
         assert len(started) <= 3 + (threads if threads > 1 else 0), (count, threads)
         assert list(found) == [index * 10 for index in range(100 + min(count, 3), 100 + count)], (count, threads)
         assert sorted(started) == list(range(100, 100 + count)), (count, threads)
+    started = []
+    found = prefetch_map(started.append, range(1000), 2)
+    next(found)
+    found.close()
+    assert len(started) <= 3  # who stops asking waits for nothing that has not begun
 
 
 def failing(items: Iterable[int]) -> Iterable[int]:
@@ -90,14 +92,6 @@ def test_what_fails_is_told_when_its_turn_comes(threads: int) -> None:
             for found in prefetch_map(read, items, threads):
                 seen.append(found)
         assert seen == [0, 1, 2, 3]
-
-
-def test_who_stops_asking_waits_for_nothing_that_has_not_begun() -> None:
-    started: list[int] = []
-    found = prefetch_map(started.append, range(1000), 2)
-    next(found)
-    found.close()
-    assert len(started) <= 3
 
 
 def test_items_are_asked_for_in_the_thread_of_the_caller() -> None:

@@ -22,13 +22,13 @@ from normlift_ns.core.lift import lift
 from normlift_ns.core.reliability import norm_of_reliability
 from normlift_ns.core.sparse import SparseRows
 from normlift_ns.errors import InputError
+from tests.encoders.tiny import DEVICES
 from tests.examples import examples
 from tests.random_scenes import dense, generator, random_evidence, unit_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 VIEWS = [3, 0, 1, 5, 2, 4, 0]
 SEEDS = st.integers(0, 2**31)
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
 
 
 def things(seed: int, gaussians: int = 60, views: int = 5, count: int = 4) -> Evidence:
@@ -66,11 +66,8 @@ def oracle(evidence: Evidence, features: torch.Tensor, power: float, level: torc
         for v in range(evidence.num_views):
             of_view = [s for s in mine if view[s] == v]
             total = torch.maximum(whole[:, v], weight[:, of_view].sum(1))
-            if not bool((held & (total > 0)).any()):
-                continue
-            median = total[held & (total > 0)].median()
-            for j in held.nonzero().flatten().tolist():
-                if total[j] > 0 and total[j] >= 0.5 * median:
+            for j in (held & (total > 0)).nonzero().flatten().tolist():
+                if total[j] >= 0.5 * total[held & (total > 0)].median():
                     kept = [s for s in of_view if weight[j, s] >= 0.02 * total[j]]
                     p[j, kept] = weight[j, kept] / total[j]
                     sees[j, v] = True
@@ -255,7 +252,7 @@ def test_scale_of_weights_does_not_matter_and_half_precision_stays():
     assert torch.allclose(half.double(), expected, atol=2e-3)
 
 
-def test_little_evidence():
+def test_little_evidence_and_opposite_features():
     for gaussians, counts in ((0, []), (0, [2, 1]), (5, []), (5, [0, 0]), (5, [3]), (5, [1, 1])):
         size = sum(counts)
         features = unit_rows(size, 4, 0, torch.float32) if size > 0 else torch.zeros(0, 4)
@@ -264,9 +261,7 @@ def test_little_evidence():
             assert found.isfinite().all() and found.shape == features.shape
             if len([c for c in counts if c > 0]) < 2 or gaussians == 0:
                 assert torch.equal(found, features)
-
-
-def test_opposite_features_leave_a_row_as_it_is():
+    # Opposite features leave a row as it is
     evidence = of_dense(torch.ones(4, 2, dtype=torch.float64), [1, 1])
     features = torch.tensor([[1.0, 0.0], [-1.0, 0.0]])
     assert torch.equal(consensus(evidence, features).features, features)
@@ -279,17 +274,11 @@ def test_refusals(unchecked):
         ({"features": features[:3]}, r"features.*\b20\b.*\b3"),
         ({"level": torch.zeros(3, dtype=torch.int64)}, r"level .*s = 20.*\(3,\)"),
         ({"power": -1.0}, "power .*-1"),
-        ({"power": float("nan")}, "power .*nan"),
-        ({"power": "1"}, "power .*'1'"),
         ({"sample": 0}, "sample .*0"),
         ({"sample": 1.5}, "sample .*1.5"),
-        ({"sample": "a"}, "sample .*'a'"),
         ({"least": -0.1}, r"least .*-0\.1"),
         ({"least": 1.1}, r"least .*1\.1"),
-        ({"least": float("nan")}, "least .*nan"),
         ({"features": torch.ones(20)}, r"features .*float32 \(20,\)"),
-        ({"features": features.long()}, r"int64 \(20, 4\)"),
-        ({"level": torch.arange(20.0)}, "level "),
         ({"level": torch.arange(20) - 1}, "level "),
     ):
         with pytest.raises(InputError, match=message):

@@ -5,20 +5,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns import Evidence, consensus, lift, rasterize_evidence
-from normlift_ns.core.evidence import MASKED, Entries, _join, _join_by_sorting
-from normlift_ns.encoders.base import joint_partition
-from tests.examples import examples
-from tests.random_scenes import (
-    dense,
-    generator,
-    orbit,
-    random_evidence,
-    random_labels,
-    random_scene,
-    same_evidence,
-    unit_rows,
-)
+from normlift_ns import Evidence, consensus, lift
+from normlift_ns.core.evidence import Entries, _join, _join_by_sorting
+from tests.random_scenes import dense, generator, random_evidence, same_evidence, unit_rows
 
 VIEWS = [3, 0, 1, 5, 2]
 SEEDS = st.integers(0, 2**31)
@@ -116,45 +105,6 @@ def test_columns_and_views_that_do_not_fit_are_refused():
     ):
         with pytest.raises(ValueError, match=message):
             replace(evidence, **change)
-
-
-@pytest.mark.parametrize(("power", "dtype"), [(1, torch.float32), (2, torch.float64)])
-@examples(2)
-@given(seed=SEEDS)
-def test_cells_give_the_evidence_of_every_level(power, dtype, seed):
-    """Rasterized once on the joint cells, evidence is that of each level rasterized by itself."""
-    scene, cameras = random_scene(20, seed), orbit(2, width=20, height=17)
-    maps = [
-        torch.stack([random_labels(c, 4, seed + i + 10 * v, 3 + i) for i in range(3)]) for v, c in enumerate(cameras)
-    ]
-    masked = [torch.rand(c.height, c.width, generator=generator(seed)) < 0.1 for c in cameras]
-    cut = [joint_partition(m) for m in maps]
-
-    def rasterized(labels, counts):
-        labels = [x.masked_fill(m, MASKED) for x, m in zip(labels, masked)]
-        return rasterize_evidence(scene, cameras, labels, num_regions=counts, weight_power=power, dtype=dtype)
-
-    cells = rasterized([labels for labels, _ in cut], [regions.shape[1] for _, regions in cut])
-    for level in range(3):
-        columns = torch.cat([torch.where(r >= 0, r + 4 * v, -1) for v, (_, r) in enumerate(cut)], dim=1)[level][None]
-        found = cells.regroup(columns, torch.tensor([0] * 4 + [1] * 4).int())
-        alone = rasterized([m[level] for m in maps], [4, 4])
-        tolerance = 1e-13 if dtype == torch.float64 else 1e-6
-        assert torch.allclose(dense(found.rows, 8), dense(alone.rows, 8), rtol=tolerance, atol=0)
-        assert torch.allclose(dense(found.unlabeled, 2), dense(alone.unlabeled, 2), rtol=tolerance, atol=0)
-        assert torch.equal(found.rows.column, alone.rows.column)
-        assert found.rows.weight.dtype == alone.rows.weight.dtype == dtype
-
-
-def test_save_and_load_are_exact(tmp_path):
-    path = tmp_path / "e.safetensors"
-    with pytest.raises(FileNotFoundError):
-        Evidence.load(path)
-    for dtype in (torch.float32, torch.float64):
-        evidence = random_evidence(15, VIEWS, 3, dtype=dtype)
-        evidence.save(path)
-        assert same_evidence(Evidence.load(path), evidence)
-        assert list(tmp_path.iterdir()) == [path]
 
 
 @st.composite

@@ -41,11 +41,10 @@ def test_cosines_are_those_of_neighbors_that_share_regions(levels):
     wanted = expected(lifted, pairs, level)
     assert 100 < len(wanted) < 1500
     torch.testing.assert_close(found.sort().values, torch.tensor(wanted, dtype=torch.float64).sort().values)
-
-
-def test_gaussians_without_evidence_share_no_region():
-    rows = random_evidence(6, COUNTS, seed=3, fill=0.5)
-    together, both = shared_views(rows.select_gaussians(torch.tensor([], dtype=torch.int64)), *torch.empty(2, 0).long())
+    # Gaussians without evidence share no region
+    together, both = shared_views(
+        evidence.select_gaussians(torch.tensor([], dtype=torch.int64)), *torch.empty(2, 0).long()
+    )
     assert len(together) == len(both) == 0
     empty = random_evidence(6, COUNTS, seed=3, fill=0.0)
     assert [x.tolist() for x in shared_views(empty, torch.tensor([0, 1]), torch.tensor([2, 3]))] == [[0, 0], [0, 0]]

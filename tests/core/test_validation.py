@@ -42,7 +42,7 @@ def test_feature_rows_are_refused_alike():
         lift(EVIDENCE, features)
 
 
-def test_a_vote_refuses_numbers_that_are_none():
+def test_a_vote_refuses_numbers_and_directions_that_are_none():
     expected = refine(**voters(), config=RefineConfig(vote="paper", k=5))
     for vote, name, value in itertools.product(("paper", "posterior"), ("own", "reliability"), (nan, inf, -1.0)):
         given = voters()
@@ -53,9 +53,6 @@ def test_a_vote_refuses_numbers_that_are_none():
             continue
         with pytest.raises(ValueError, match=rf"^1 of 40 values of {name} .*{name}\[7\] = "):
             refine(**given, config=config)
-
-
-def test_a_vote_refuses_directions_that_are_none():
     for value in BAD_ROWS:
         given = voters()
         given["directions"][3] *= value
@@ -70,9 +67,3 @@ def test_a_vote_of_nobody_says_so():
         with pytest.warns(UserWarning, match=f"{n} Gaussian"):
             source = refine(torch.zeros(n, 3), torch.ones(n, 1), torch.ones(n), own=torch.ones(n))
         assert source.tolist() == list(range(n))
-
-
-def test_entries_of_an_empty_scene_are_refused():
-    entries = Entries(torch.tensor([0]), torch.tensor([0]), torch.ones(1), num_regions=(1,))
-    with pytest.raises(ValueError, match=r"gaussian must be in 0\.\.-1, got 0"):
-        Evidence.from_entries([entries], 0)

@@ -16,17 +16,21 @@ from normlift_ns.data.open_scene import SplatScene, save_splat, splatfacto_check
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.data.transforms import decompose_similarity
 
-NUMBERS = {
-    "SIMPLE_PINHOLE": 0,
-    "PINHOLE": 1,
-    "SIMPLE_RADIAL": 2,
-    "RADIAL": 3,
-    "OPENCV": 4,
-    "OPENCV_FISHEYE": 5,
-    "FULL_OPENCV": 6,
+MODELS = {
+    "SIMPLE_PINHOLE": (0, "fx cx cy"),
+    "PINHOLE": (1, "fx fy cx cy"),
+    "SIMPLE_RADIAL": (2, "fx cx cy k1"),
+    "RADIAL": (3, "fx cx cy k1 k2"),
+    "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4"),
+    "FULL_OPENCV": (6, "fx fy cx cy k1 k2 p1 p2 k3 0.01 0 0"),
+    "SIMPLE_RADIAL_FISHEYE": (8, "fx cx cy k1"),
+    "RADIAL_FISHEYE": (9, "fx cx cy k1 k2"),
+    "THIN_PRISM_FISHEYE": (10, "fx fy cx cy k1 k2 0 0 k3 k4 0 0"),
+    "SIMPLE_FISHEYE": (14, "fx cx cy"),
+    "FISHEYE": (15, "fx fy cx cy"),
 }
-NUMBERS |= {"SIMPLE_RADIAL_FISHEYE": 8, "RADIAL_FISHEYE": 9, "THIN_PRISM_FISHEYE": 10}
-NUMBERS |= {"SIMPLE_FISHEYE": 14, "FISHEYE": 15}
+"""Number and parameters of each camera model of COLMAP."""
 
 
 def random_splat(n: int = 200, degree: int = 3, seed: int = 0) -> SplatParameters:
@@ -117,20 +121,7 @@ def in_world(splat: SplatParameters, matrix: np.ndarray) -> SplatParameters:
 
 
 def camera_parameters(model: str, c: Intrinsics) -> list[float]:
-    return {
-        "SIMPLE_PINHOLE": [c.fx, c.cx, c.cy],
-        "PINHOLE": [c.fx, c.fy, c.cx, c.cy],
-        "SIMPLE_RADIAL": [c.fx, c.cx, c.cy, c.k1],
-        "RADIAL": [c.fx, c.cx, c.cy, c.k1, c.k2],
-        "OPENCV": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2],
-        "FULL_OPENCV": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3, 0.01, 0.0, 0.0],
-        "OPENCV_FISHEYE": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.k3, c.k4],
-        "SIMPLE_RADIAL_FISHEYE": [c.fx, c.cx, c.cy, c.k1],
-        "RADIAL_FISHEYE": [c.fx, c.cx, c.cy, c.k1, c.k2],
-        "SIMPLE_FISHEYE": [c.fx, c.cx, c.cy],
-        "FISHEYE": [c.fx, c.fy, c.cx, c.cy],
-        "THIN_PRISM_FISHEYE": [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, 0.0, 0.0, c.k3, c.k4, 0.0, 0.0],
-    }[model]
+    return [getattr(c, name) if name.isidentifier() else float(name) for name in MODELS[model][1].split()]
 
 
 def write_colmap(folder: Path, frames: Sequence[Frame], model="OPENCV", *, binary=True, points=None) -> Path:
@@ -165,7 +156,7 @@ def _write_binary(place: Path, rows: list, model: str, points: np.ndarray) -> No
     cameras = images = struct.pack("<Q", len(rows))
     for i, q, t, name, c in rows:
         parameters = camera_parameters(model, c)
-        cameras += struct.pack(f"<iiQQ{len(parameters)}d", i, NUMBERS[model], c.width, c.height, *parameters)
+        cameras += struct.pack(f"<iiQQ{len(parameters)}d", i, MODELS[model][0], c.width, c.height, *parameters)
         images += struct.pack("<I7dI", i, *q, *t, i) + name.encode() + b"\0"
         images += struct.pack("<Q", 2) + struct.pack("<ddqddq", 1, 2, -1, 3, 4, 7)
     clouds = struct.pack("<Q", len(points))

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 import zstandard
+from numpy.lib.recfunctions import repack_fields
 from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
@@ -26,9 +27,7 @@ from normlift_ns.data.open_splat import _format, _read
 from normlift_ns.data.splat import SplatParameters, read_ply
 from normlift_ns.data.spz import encode_spz, read_spz
 from normlift_ns.errors import InputError
-from normlift_ns.rasterization.projection import rotation_matrices
-from tests.data.scene_files import ply_columns, random_splat, rows_of, write_ply
-from tests.hostile import damaged, fuzz, hostile_json, no_files
+from tests.data.scene_files import in_world, ply_columns, random_splat, rows_of, write_ply
 
 N = 700
 
@@ -67,23 +66,21 @@ def angles(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
 
 PRECISION = {
     "spz": {"means": 1.2e-6, "scales": 0.0313, "opacities": 0.002, "quats": 0.004, "colors": 0.0131, "rest": 0.0626},
-    "splat": {"means": 0, "scales": 1e-5, "opacities": 0.004, "quats": 0.03, "colors": 0.014, "rest": None},
     "glb": {"means": 0, "scales": 1e-5, "opacities": 1e-6, "quats": 1e-6, "colors": 0, "rest": 0},
     "ply": {"means": 0.005, "scales": 0.005, "opacities": 0.002, "quats": 0.004, "colors": 0.014, "rest": 0.0314},
 }
 """Largest errors by format, for a scene of a few units."""
 
 
-@pytest.mark.parametrize("kind", ["spz", "spz4", "splat", "glb", "ply"])
+@pytest.mark.parametrize("kind", ["spz", "spz4", "glb", "ply"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_a_splat_comes_back_within_the_precision_of_its_format(tmp_path: Path, kind: str, degree: int) -> None:
     made = random_splat(N, degree)
     splat = replace(made, features_rest=made.features_rest.clamp(-1, 1), features_dc=made.features_dc.clamp(-1.7, 1.7))
     path, rows = write_any(tmp_path, splat, kind)
     found = _read(path)
-    expected, limits = rows_of(splat, rows), PRECISION[kind[:3] if kind != "splat" else kind]  # type: ignore[arg-type]
     assert sorted(rows) == list(range(N))
-    ours, theirs = found.splat, expected
+    ours, theirs, limits = found.splat, rows_of(splat, rows), PRECISION[kind[:3]]  # type: ignore[arg-type]
     errors = {
         "means": (ours.means - theirs.means).abs().max(),
         "scales": (ours.scales - theirs.scales).abs().max(),
@@ -91,9 +88,7 @@ def test_a_splat_comes_back_within_the_precision_of_its_format(tmp_path: Path, k
         "quats": angles(ours.quats, theirs.quats).max(),
         "colors": (ours.features_dc - theirs.features_dc).abs().max(),
     }
-    if limits["rest"] is None:
-        assert ours.degree == 0
-    elif degree > 0:
+    if degree > 0:
         assert ours.degree == (degree if "spz" in kind else min(degree, 3))
         kept = theirs.features_rest[:, : ours.features_rest.shape[1]]
         errors["rest"] = (ours.features_rest - kept).abs().max()
@@ -105,20 +100,8 @@ def test_a_splat_comes_back_within_the_precision_of_its_format(tmp_path: Path, k
 
 
 def test_other_writers_of_the_same_formats_are_read(tmp_path: Path) -> None:
-    """Version 2 of SPZ, glTF with buffers outside and quantized attributes, SPZ in glTF, PLY of the first version."""
+    """glTF with buffers outside and quantized attributes, SPZ in glTF, PLY of the first version."""
     splat = random_splat(50, 1)
-    header, *fields = _fields(encode_spz(splat), splat)
-    flags = bytearray(header)
-    flags[4], flags[14] = 2, 1
-    unit = normalize_quats(splat.quats)
-    xyz = unit[:, 1:] * torch.where(unit[:, :1] < 0, -1, 1)
-    fields[4] = (xyz * 127.5 + 127.5).round().clamp(0, 255).byte().numpy().tobytes()
-    path = tmp_path / "scene.spz"
-    path.write_bytes(gzip.compress(bytes(flags) + b"".join(fields)))
-    old = read_spz(path)
-    assert old.rasterize_mode == "antialiased"
-    assert float(angles(old.splat.quats, splat.quats).median()) < 0.02
-
     document, binary = _glb(encode_glb(splat, {}, {}))
     document["buffers"][0]["uri"] = "my%20scene.bin"
     (tmp_path / "my scene.bin").write_bytes(binary)
@@ -127,7 +110,7 @@ def test_other_writers_of_the_same_formats_are_read(tmp_path: Path) -> None:
     plain = _read(path).splat
     assert torch.equal(plain.means, splat.means)
     document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
-    attributes, quats = _primitive(document)["attributes"], unit.roll(-1, dims=1)
+    attributes, quats = _primitive(document)["attributes"], normalize_quats(splat.quats).roll(-1, dims=1)
     packed = (quats * 32767).round().short().numpy().tobytes()
     opacity = (splat.opacities.sigmoid() * 255).round().byte().numpy()
     strided = np.zeros((50, 4), np.uint8)  # rows of four bytes, of which one is used
@@ -161,60 +144,32 @@ def test_other_writers_of_the_same_formats_are_read(tmp_path: Path) -> None:
     assert read_ply(path).rasterize_mode == "antialiased"
     ply = PlyData.read(str(path))
     names = [name for name in ply["chunk"].data.dtype.names if not name.endswith(("_r", "_g", "_b"))]
-    first = PlyData([_element("chunk", ply["chunk"].data[names]), ply["vertex"], ply["sh"]], byte_order="<")
-    first.write(str(tmp_path / "first.ply"))
+    chunks = PlyElement.describe(repack_fields(ply["chunk"].data[names]), "chunk")
+    PlyData([chunks, ply["vertex"], ply["sh"]], byte_order="<").write(str(tmp_path / "first.ply"))
     assert float((read_ply(tmp_path / "first.ply").splat.means - splat.means[encoded.rows]).abs().max()) < 0.01
-
-
-def _covariances(splat: SplatParameters) -> torch.Tensor:
-    axes = rotation_matrices(splat.quats.double()) * splat.scales.double().exp()[:, None]
-    return axes @ axes.transpose(1, 2)
 
 
 @pytest.mark.parametrize("is_matrix", [False, True])
 def test_transforms_of_gltf_nodes_move_the_splat(tmp_path: Path, is_matrix: bool) -> None:
-    """Means, covariances and colors, against the matrix product in float64."""
-    from gsplat.cuda._torch_impl import _spherical_harmonics  # noqa: PLC0415 (slow import)
-
     splat, outer, inner = random_splat(50, 3), Rotation.from_rotvec([0.3, -1.1, 0.4]), Rotation.from_rotvec([2, 1, 0])
-    turn, scale, shift = outer * inner, 2.5 * 0.2, [30, -4, 5] + 2.5 * outer.apply([1, 2, 3])
     parent = {"rotation": outer.as_quat().tolist(), "scale": [2.5] * 3, "translation": [30, -4, 5], "children": [2]}
     child = {"rotation": inner.as_quat().tolist(), "scale": [0.2] * 3, "translation": [1, 2, 3], "mesh": 0}
+    first, second = np.eye(4), np.eye(4)
+    first[:3] = np.column_stack([2.5 * outer.as_matrix(), [30, -4, 5]])
+    second[:3] = np.column_stack([0.2 * inner.as_matrix(), [1, 2, 3]])
     if is_matrix:
-        matrix = np.eye(4)
-        matrix[:3] = np.column_stack([0.2 * inner.as_matrix(), [1, 2, 3]])
-        child = {"matrix": matrix.T.ravel().tolist(), "mesh": 0}
+        child = {"matrix": second.T.ravel().tolist(), "mesh": 0}
     document, binary = _glb(encode_glb(splat, {}, {}))
     document["nodes"] = [{"children": [1]}, parent, child]
     document["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(binary).decode()
     path = tmp_path / "scene.gltf"
     path.write_text(json.dumps(document))
-    file = _read(path)
-    found, rotation = file.splat, torch.from_numpy(turn.as_matrix())
+    file, expected = _read(path), in_world(splat, first @ second)
     assert "scale 0.5" in file.remarks[0]
-    expected = scale * splat.means.double() @ rotation.T + torch.from_numpy(shift)
-    torch.testing.assert_close(found.means.double(), expected, rtol=1e-6, atol=1e-6)
-    expected = scale**2 * rotation @ _covariances(splat) @ rotation.T
-    torch.testing.assert_close(_covariances(found), expected, rtol=1e-4, atol=1e-8)
-    assert torch.equal(found.features_dc, splat.features_dc)
-    towards = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(1)))
-    before = _spherical_harmonics(3, towards, torch.cat([0 * splat.features_dc[:, None], splat.features_rest], dim=1))
-    turned = towards @ rotation.T.float()
-    after = _spherical_harmonics(3, turned, torch.cat([0 * found.features_dc[:, None], found.features_rest], dim=1))
-    assert float(before.abs().max()) > 1
-    torch.testing.assert_close(after, before, rtol=1e-5, atol=1e-5)
-
-
-def _element(name: str, table: np.ndarray) -> Any:
-    return PlyElement.describe(np.rec.fromarrays([table[n] for n in table.dtype.names], names=table.dtype.names), name)
-
-
-def _fields(data: bytes, splat: SplatParameters) -> list[bytes]:
-    """The header and the six attributes of an SPZ file of version 3."""
-    content, n, k = gzip.decompress(data), len(splat), splat.features_rest.shape[1]
-    ends = np.cumsum([16, 9 * n, n, 3 * n, 3 * n, 4 * n, 3 * k * n]).tolist()
-    assert ends[-1] == len(content)
-    return [content[start:end] for start, end in zip([0, *ends], ends)]
+    assert float(angles(file.splat.quats, expected.quats).max()) < 1e-5
+    for name in ("means", "scales", "features_dc", "features_rest"):
+        found = getattr(file.splat, name)
+        torch.testing.assert_close(found, getattr(expected, name), rtol=1e-5, atol=1e-5, msg=name)
 
 
 def _glb(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -275,7 +230,6 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
         ("a.glb", _with_glb(lambda d: d["buffers"][0].update(uri="../a.bin")), "in the same folder"),
         ("a.glb", _with_glb(lambda d: d["accessors"][3].update(bufferView=0, byteOffset=4)), "damaged|linear scales"),
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(scale=[1, 1, 2])), "not a similarity.*PLY file"),
-        ("a.glb", _with_glb(lambda d: d["nodes"][0].update(scale=[-1, 1, 1])), "not a similarity"),
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(scale=[1e300] * 3)), "not finite"),
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0])), "rotation of a node is zero"),
         ("a.glb", _with_glb(lambda d: d["nodes"][0].update(matrix=[1] * 12)), "nodes.*matrix"),
@@ -287,9 +241,7 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
         ("a.splat", bytes(33), "33 bytes, expected a positive multiple of 32"),
         ("a.splat", np.full(16, -1, "<f4").tobytes(), "negative scales"),
         ("a.ksplat", bytes(4096), "KSPLAT file.*npx @playcanvas/splat-transform a.ksplat a.ply"),
-        ("a.lcc", b"{}", "LCC file.*npx @playcanvas/splat-transform a.lcc a.ply"),
         ("lod-meta.json", b"{}", "streamed SOG file.*Export a PLY file"),
-        ("a.sog", b"PK\3\4", "SOG file.*npx"),
         ("meta.json", b"{}", "SOG file.*npx @playcanvas/splat-transform meta.json meta.ply"),
         ("a.usdc", b"PXR-USDC", "USDC file.*Export a PLY file"),
     ):  # fmt: skip
@@ -348,35 +300,6 @@ def test_extensions_of_spz_are_named(tmp_path: Path, version: Literal[3, 4]) -> 
     for name, value in expected.splat.parameters.items():
         assert torch.equal(found.splat.parameters[name], value)
     assert [text for text in found.remarks if text not in expected.remarks and "--world-transform" in text] != []
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("kind", ["spz", "spz4", "splat", "glb", "ply"])
-def test_damage_is_a_message(tmp_path: Path, kind: str) -> None:
-    path, _ = write_any(tmp_path, random_splat(20, 1), kind)
-    whole = path.read_bytes()
-    contents = damaged(whole)
-    if kind == "spz":  # damage under a valid checksum
-        contents |= damaged(gzip.decompress(whole)).map(gzip.compress)
-    if kind == "glb":
-        document, binary = _glb(whole)
-        contents |= hostile_json(document).map(
-            lambda text: struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
-            + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-        )  # fmt: skip
-
-    def load() -> None:
-        try:
-            assert len(_read(path).splat) > 0
-        except (InputError, FileNotFoundError) as error:
-            assert str(tmp_path) in str(error), error
-            raise
-
-    load()
-    fuzz(20, contents, path, load)
-    for _ in no_files(path):
-        with pytest.raises((FileNotFoundError, InputError)):
-            _read(path)
 
 
 def test_the_first_bytes_tell_the_format(tmp_path: Path) -> None:

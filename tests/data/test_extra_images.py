@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from normlift_ns import InputError, LiftOptions, SourceOptions, SplatOptions, lift_run, open_run, open_scene, open_splat
+from normlift_ns import InputError, LiftOptions, SourceOptions, lift_run, open_run, open_scene
 from normlift_ns.data.extra_images import add_extra_images
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
-from normlift_ns.data.splat import SplatParameters
-from tests.data.scene_files import ply_columns, write_ply
 
 TURNED = np.array([[0.0, -3.0, 0.0, 5.0], [0.0, 0.0, -3.0, 1.0], [3.0, 0.0, 0.0, -2.0], [0.0, 0.0, 0.0, 1.0]])
 """Another world: turned, three times as large and elsewhere."""
@@ -70,27 +68,16 @@ def test_new_cameras_stand_in_the_world_of_the_scene(scene, larger) -> None:
         found.train[len(found.train)]
 
 
-def test_splats_take_them_too(scene, larger, tmp_path: Path) -> None:
-    write_ply(tmp_path / "splat.ply", ply_columns(SplatParameters(**scene.parameters)))
-    transforms, world = scene.location.folder / "transforms.json", scene.location.run_dir / "dataparser_transforms.json"
-    splat = open_splat(tmp_path / "splat.ply", SplatOptions(transforms=transforms, world_transform=world))
-    found = add_extra_images(splat, larger(TURNED))
-    assert len(found.train) == len(splat.train) + 2
-    place = [Path(name).name for name in found.train.names].index("before.png")
-    expected = scene.train.cameras[4].world_to_camera
-    assert torch.allclose(found.train.cameras[place].world_to_camera, expected, atol=1e-5)
-
-
 def test_worlds_that_differ_are_refused_by_name(scene, larger) -> None:
     moved = scene.train.names[3]
-    with pytest.raises(InputError, match=rf"{Path(moved).name} .*14 old"):
-        add_extra_images(scene, larger(move=moved))
-    with pytest.raises(InputError, match="already belong to"):
-        add_extra_images(scene, larger(frames=slice(0, -2)))
-    with pytest.raises(InputError, match="contains 1 of the"):
-        add_extra_images(scene, larger(frames=slice(-3, None)))
-    with pytest.raises(InputError, match="contains 0 of the"):
-        add_extra_images(scene, larger(frames=slice(-2, None)))
+    for how, message in (
+        ({"move": moved}, rf"{Path(moved).name} .*14 old"),
+        ({"frames": slice(0, -2)}, "already belong to"),
+        ({"frames": slice(-3, None)}, "contains 1 of the"),
+        ({"frames": slice(-2, None)}, "contains 0 of the"),
+    ):
+        with pytest.raises(InputError, match=message):
+            add_extra_images(scene, larger(**how))
 
 
 def test_a_lifted_run_knows_them(scene, larger, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,19 +112,19 @@ def test_labels_and_masks_are_undistorted_without_interpolation(tmp_path: Path) 
     Image.fromarray(rng.integers(0, 255, (160, 200, 3), np.uint8)).save(file)
     Image.fromarray(mask).save(tmp_path / "mask.png")
     lens = WIDE._replace(cy=70.0, k1=0.01)  # the upper and lower rim lie outside of the original image
-    for name in (tmp_path / "mask.png", None):
-        views = ImageViews([Frame(file, "a.png", np.eye(4)[:3], lens, name)], torch.zeros(3))
-        matrix = views.cameras[0].K.double().numpy()
-        y, x = np.mgrid[:160, :200] + 0.5
-        source = project((np.stack([x, y], -1) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], lens)
-        column, row = np.floor(source).astype(int).transpose(2, 0, 1)
-        inside = (column >= 0) & (column < 200) & (row >= 0) & (row < 160)
-        clear = (np.abs(source - np.rint(source)) > 1e-3).all(-1)  # float32 decides at borders of pixels
-        assert 0 < (~inside).sum() < 0.1 * inside.size
-        taken = np.ones((160, 200), bool) if name is None else mask
-        expected = inside & taken[row.clip(0, 159), column.clip(0, 199)]
-        found = views[0].mask
+    frame = Frame(file, "a.png", np.eye(4)[:3], lens)
+    views = ImageViews([frame], torch.zeros(3))
+    matrix = views.cameras[0].K.double().numpy()
+    y, x = np.mgrid[:160, :200] + 0.5
+    source = project((np.stack([x, y], -1) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], lens)
+    column, row = np.floor(source).astype(int).transpose(2, 0, 1)
+    inside = (column >= 0) & (column < 200) & (row >= 0) & (row < 160)
+    clear = (np.abs(source - np.rint(source)) > 1e-3).all(-1)  # float32 decides at borders of pixels
+    assert 0 < (~inside).sum() < 0.1 * inside.size
+    for taken, file_of_mask in ((np.ones((160, 200), bool), None), (mask, tmp_path / "mask.png")):
+        found = ImageViews([replace(frame, mask=file_of_mask)], torch.zeros(3))[0].mask
         assert found is not None
+        expected = inside & taken[row.clip(0, 159), column.clip(0, 199)]
         assert np.array_equal(found.numpy()[clear], expected[clear])
     undistort = label_undistortion(views)
     assert undistort is not None
@@ -131,25 +132,11 @@ def test_labels_and_masks_are_undistorted_without_interpolation(tmp_path: Path) 
     assert np.array_equal(undistort("a.png", labels[None])[0][clear], expected[clear])
     regions = LabelFiles(maps, undistort=undistort).labels(views[0].image, "a.png")[0, 0].numpy()
     assert np.array_equal(regions[clear], (expected - (expected > 0))[clear])
-    assert (
-        label_undistortion(
-            ImageViews([Frame(file, "a.png", np.eye(4)[:3], lens._replace(fisheye=False))], torch.zeros(3))
-        )
-        is None
-    )
+    flat = replace(frame, intrinsics=lens._replace(fisheye=False))
+    assert label_undistortion(ImageViews([flat], torch.zeros(3))) is None
 
 
-@pytest.mark.parametrize(
-    "lens",
-    [
-        LENS,
-        LENS._replace(fx=400.0, fy=400.0),
-        LENS._replace(k1=0.5, k2=0.5),
-        WIDE,
-        WIDE._replace(cx=90.0, cy=90.0, k1=-0.05),
-        LENS._replace(width=220, height=90),
-    ],
-)
+@pytest.mark.parametrize("lens", [LENS, LENS._replace(k1=0.5, k2=0.5), WIDE._replace(cx=90.0, cy=90.0, k1=-0.05)])
 def test_the_longest_focal_length_that_keeps_nine_tenths(tmp_path: Path, lens: Intrinsics) -> None:
     views = ImageViews([Frame(tmp_path, "a", np.eye(4)[:3], lens)], torch.zeros(3))
     matrix, tangents = views.cameras[0].K.double().numpy(), unproject(lens)
@@ -207,21 +194,19 @@ def test_pixels_that_the_image_does_not_show_have_no_region_and_no_color(tmp_pat
 
 
 def test_fisheye_cameras_are_stored_for_nerfstudio(tmp_path: Path) -> None:
-    """Zero distortion too, which nerfstudio takes for a pinhole; one type of camera only."""
+    """Zero distortion, which nerfstudio takes for a pinhole; one type of camera only."""
     (tmp_path / "images").mkdir()
     Image.new("RGB", (200, 160)).save(tmp_path / "images" / "a.png")
     zero = LENS._replace(k1=0.0, k2=0.0, k3=0.0, k4=0.0)
-    for lens in (LENS, zero):
-        path = transforms(tmp_path, lens, {"camera_model": "OPENCV_FISHEYE"})
-        frames = read_transforms(path).frames
-        (tmp_path / "again.json").unlink(missing_ok=True)
-        write_transforms(tmp_path / "again.json", frames, ())
-        again = read_transforms(tmp_path / "again.json").frames
-        assert json.loads((tmp_path / "again.json").read_text())["camera_model"] == "OPENCV_FISHEYE"
-        assert again[0].intrinsics == frames[0].intrinsics
-        assert again[0].intrinsics.is_distorted
-        assert again[0].intrinsics[:6] == lens[:6]
-        assert np.allclose(again[0].intrinsics[6:12], lens[6:12], atol=1e-9)
+    path = transforms(tmp_path, zero, {"camera_model": "OPENCV_FISHEYE"})
+    frames = read_transforms(path).frames
+    write_transforms(tmp_path / "again.json", frames, ())
+    again = read_transforms(tmp_path / "again.json").frames
+    assert json.loads((tmp_path / "again.json").read_text())["camera_model"] == "OPENCV_FISHEYE"
+    assert again[0].intrinsics == frames[0].intrinsics
+    assert again[0].intrinsics.is_distorted
+    assert again[0].intrinsics[:6] == zero[:6]
+    assert np.allclose(again[0].intrinsics[6:12], zero[6:12], atol=1e-9)
     mixed = [frames[0], Frame(tmp_path / "b.png", "b.png", np.eye(4)[:3], zero._replace(fisheye=False))]
     with pytest.raises(InputError, match=r"images/a\.png has a fisheye .*b\.png has a perspective"):
         check_frames(mixed, path)

@@ -41,19 +41,13 @@ def test_ranks_that_are_missing_or_of_two_trainings_are_refused(tmp_path: Path) 
         read_gsplat_checkpoint(tmp_path / "ckpt_7_rank0.pt")
 
 
-class _Payload:
-    def __reduce__(self):
-        return (print, ("run",))
-
-
-def test_other_content_is_refused(tmp_path: Path, capfd) -> None:
+def test_other_content_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.pt"
     for content, message in (
         ({"step": 1, "pipeline": {}}, "config.yml with --load-config"),
         ([1, 2], "`splats`, found list"),
         (((torch.zeros(3),), 30000), "found tuple.*Inria.*--load-ply"),
         ({"splats": {"means": torch.zeros(2, 3)}}, "quats, scales, opacities, sh0, shN"),
-        ({"splats": {"means": _Payload()}}, "Python objects"),
     ):
         torch.save(content, path)
         with pytest.raises(InputError, match=message):
@@ -64,7 +58,6 @@ def test_other_content_is_refused(tmp_path: Path, capfd) -> None:
     for name, value, message in (
         ("means", torch.full((200, 3), torch.nan), "means .* NaN"),
         ("means", torch.zeros(200, 2), r"means is torch.float32 \(200, 2\)"),
-        ("means", torch.zeros(200, 3, dtype=torch.int64), "means is torch.int64"),
         ("quats", torch.zeros(100, 4), r"quats is torch.float32 \(100, 4\)"),
         ("sh0", torch.zeros(200, 3), r"sh0 has shape \(200, 3\)"),
         ("shN", torch.zeros(200, 7, 3), r"harmonics have shape \(200, 7, 3\)"),
@@ -74,7 +67,6 @@ def test_other_content_is_refused(tmp_path: Path, capfd) -> None:
         torch.save(content, path)
         with pytest.raises(InputError, match=message):
             read_gsplat_checkpoint(path)
-    assert "run" not in capfd.readouterr().out
     content = torch.load(write_gsplat(path, random_splat()))
     content["splats"]["uncertainty"] = torch.zeros(200)
     torch.save(content, path)
@@ -141,7 +133,6 @@ def test_other_primitives_and_damaged_settings_are_refused(tmp_path: Path) -> No
         ("with_ut: false", "with_ut: true", r"with_ut true \(3DGUT\)"),
         ("with_ut: false", "with_eval3d: true", r"with_eval3d true \(3DGUT\)"),
         ("camera_model: pinhole", "camera_model: fisheye", "camera_model fisheye"),
-        ("camera_model: pinhole", "camera_model: ortho", "camera_model ortho"),
         ("ckpt: null", "model_type: 2dgs-inria", "model_type 2dgs-inria"),
         ("ckpt: null", "model_type: 2dgs\nnear_plane: -1", "near_plane '-1', expected a number above 0"),
         ("antialiased: true", "antialiased: maybe", "antialiased 'maybe', expected true or false"),

@@ -29,10 +29,7 @@ def test_view_features_accept_what_fits_and_refuse_the_rest():
     view = ViewFeatures(torch.tensor([[-1, 0], [0, 0]], dtype=torch.int32), UNIT)
     assert view.features.shape == (2, 3)
     ViewFeatures(torch.full((4, 5), -1, dtype=torch.int32), torch.zeros(0, 3))
-
-
-def test_own_features_of_no_use_are_refused_by_name():
-    labels = torch.zeros(2, 2).long()
+    labels = none.long()  # of one's own
     for pair, texts, name in (
         ((labels.to("meta"), UNIT), None, "labels of a"), ((labels, UNIT.to_sparse()), None, "vectors of a"),
         ((labels, UNIT[:, :0]), None, "vectors of a"), ((labels, UNIT), {"\ud800": UNIT[0]}, "not a valid prompt"),

@@ -93,12 +93,10 @@ def test_bad_options_say_what_to_do(tmp_path):
         ({"regions": "superpixel", "regions_dir": tmp_path}, [f"--regions-dir {tmp_path}", "--regions files"]),
         ({"regions": "grid", "sam_model": "x/y"}, ["--sam-model x/y", "--regions sam", '"grid"']),
         ({"regions": "grid", "sam_precision": "float16"}, ["--sam-precision float16", "--regions sam", '"grid"']),
-        ({"regions": "slic"}, ["auto, sam, sam3, edges, patches, superpixel, grid, files", "'slic'"]),
         ({"regions": "files"}, ["--regions files", "--regions-dir"]),
         ({"regions": "grid", "level": "1"}, ["--level 1", "--regions edges or files or sam", '"grid"']),
         ({"level": "l", "regions_dir": Path()}, ["--level", "--regions files", "'l'"]),
         ({"level": "-1", "regions_dir": Path()}, ["--level", "'-1'"]),
-        ({"features": "lerf"}, ["none, langsplat", "'lerf'"]),
         ({"features": "langsplat"}, ["--features langsplat", "--features-dir"]),
         ({"features_dir": Path("f")}, ["--features-dir f", "--features langsplat"]),
     ):

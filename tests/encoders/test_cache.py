@@ -1,6 +1,7 @@
 """The cache of regions and features: what finds an entry again, and what does not."""
 
 import random
+import weakref
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from normlift_ns.encoders.cache import CachedEncoder, CachedRegions, cached
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
 from normlift_ns.encoders.text_files import CachedTextEncoder, open_clip_text_identity
+from normlift_ns.io.arrays import save_arrays
 from normlift_ns.segmentation.regions import Grid, LabelFiles
 from tests.encoders.tiny import noise
 from tests.io.test_digests import flipped
@@ -96,50 +98,45 @@ def test_another_level_has_the_same_label_maps(tmp_path):
     assert torch.equal(first.labels, second.labels)
     assert (len(first.features), len(second.features)) == (1, 599)
     assert_same(first, again)
-
-
-def test_another_label_file_is_another_entry(tmp_path):
-    labels = tmp_path / "labels"
-    labels.mkdir()
-    source = cached(RegionFeatures(LabelFiles(labels), ColorEncoder()), tmp_path / "cache")
-    for value, regions in ((0, 0), (3, 1)):
-        np.save(labels / "a.npy", np.full((20, 30), value))
-        assert len(source.view(IMAGE, "a.jpg").features) == regions
-    (labels / "a.npy").unlink()
+    for value, regions in ((0, 0), (3, 1)):  # another file is another entry
+        np.save(tmp_path / "a.npy", np.full((1, 20, 30), value))
+        assert len(cached(source[0], tmp_path / "cache").view(IMAGE, "a.jpg").features) == regions
+    (tmp_path / "a.npy").unlink()
     with pytest.raises(FileNotFoundError, match=r"a\.jpg"):
-        source.view(IMAGE, "a.jpg")
+        cached(source[0], tmp_path / "cache").view(IMAGE, "a.jpg")
 
 
 def test_a_damaged_entry_is_computed_again(counted, tmp_path):
-    """Cut off, empty, with other names inside, with any bit flipped."""
-    source = cached(counted, tmp_path)
-    expected, tries = source.view(IMAGE, "a.jpg"), 1
-    for kind in ("regions", "features"):
+    """Cut off, empty, with other names inside, with any bit flipped; or whole, but with arrays that do not fit."""
+    source, short = cached(counted, tmp_path), torch.zeros(1, 1, 20, 30, dtype=torch.int16)
+    expected, asked_before = source.view(IMAGE, "a.jpg"), 1
+    features = [torch.full((15, 3), 0.1), torch.full((15, 3), torch.nan), torch.eye(3)[:2], torch.ones(15)]
+    features += [torch.zeros(15, 0), torch.eye(3).repeat(4, 1), torch.eye(15).half()]
+    for kind, name, unfit in (
+        ("regions", "labels", [short[..., :7], short[0], short[:0].int(), short - 2, short.float(), short.long()]),
+        ("features", "features", features),
+    ):
         (path,) = (tmp_path / kind).iterdir()
         whole = path.read_bytes()
         header = 8 + int.from_bytes(whole[:8], "little")
-        names = whole[:header].replace(b'"labels"', b'"nonons"').replace(b'"features"', b'"nonsense"')
-        wrong = [whole[: len(whole) // 2], b"", names + whole[header:], whole[:-1] + bytes([whole[-1] ^ 1])]
+        wrong = [whole[: len(whole) // 2], b"", whole[:header].replace(name.encode(), b"nonsense"[: len(name)])]
+        wrong[-1] += whole[header:]
         wrong += [flipped(whole, bit) for bit in random.Random(0).sample(range(8 * len(whole)), 12)]
+        for array in unfit:
+            save_arrays(path, {name: array.contiguous()}, key=path.stem, overwrite=True)
+            wrong.append(path.read_bytes())
         for content in wrong:
             path.write_bytes(content)
             assert_same(source.view(IMAGE, "a.jpg"), expected)
             assert path.read_bytes() == whole
-        tries += len(wrong)
-        assert asked(counted) == ((tries, 1) if kind == "regions" else (17, 17))
-        tries = 1
+        assert len(getattr(counted, "regions" if kind == "regions" else "encoder").asked) == asked_before + len(wrong)
 
 
 def test_many_regions_survive(tmp_path):
-    """Beyond 16-bit labels."""
-
-    class Many(Grid):
-        def labels(self, image, name):
-            return torch.arange(-1, 2**15 + 9, dtype=torch.int32).reshape(1, -1, 2)
-
-    regions = CachedRegions(Many(1), tmp_path)
+    labels = torch.arange(-1, 2**15 + 9, dtype=torch.int32).reshape(1, -1, 2)  # beyond 16 bits
+    many = type("Many", (Grid,), {"labels": lambda *_: labels})
     for _ in range(2):
-        assert torch.equal(regions.labels(IMAGE, "a.jpg"), Many(1).labels(IMAGE, "a.jpg"))
+        assert torch.equal(CachedRegions(many(1), tmp_path).labels(IMAGE, "a.jpg"), labels)
 
 
 def test_views_whose_features_are_kept_stand_between_others(clip, tmp_path):
@@ -212,10 +209,7 @@ def test_texts_asked_again_need_no_network(clip, tmp_path):
     for change in ({"template": "a {}"}, {"pretrained": clip.pretrained.replace(".pt", ".safetensors")}):
         with pytest.raises(AttributeError):
             kept_texts(unusable(replace(clip, **change)), tmp_path / "texts").text(["table"])
-
-
-def test_texts_of_a_folder_that_cannot_be_written_to(clip, tmp_path):
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("")  # a folder that cannot be written to
     rows = kept_texts(clip, tmp_path / "file" / "texts").text(["table"])
     assert torch.equal(rows, clip.text(["table"]))
     with pytest.raises(ValueError, match="1 of 1"):
@@ -231,6 +225,9 @@ def test_patches_seen_before_need_no_network(clip, tmp_path):
         assert torch.equal(view.labels, expected.labels) and torch.equal(view.features, expected.features)
         assert kept.identity == source.identity and kept.available(["a.jpg"]) == ["a.jpg"]
     assert torch.equal(cached(source, tmp_path).text(["red"]), clip.text(["red"]))
+    kept = cached(source, tmp_path)
+    views = [weakref.ref(kept.view(IMAGE + i, "a.jpg").features) for i in (0, 1)]
+    assert [view() for view in views] == [None, None]  # none is held
     with pytest.raises(AttributeError):
         cached(PatchFeatures(unusable(clip), 30), tmp_path).view(IMAGE, "a.jpg")
 

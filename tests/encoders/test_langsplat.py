@@ -2,7 +2,6 @@
 
 import io
 import json
-import struct
 import warnings
 import zipfile
 from functools import partial
@@ -38,9 +37,9 @@ T = 7
 
 
 def npy(descr: str, shape: tuple[int, ...], data: bytes) -> bytes:
-    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}"
-    header += " " * (-(len(header) + 11) % 64) + "\n"
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode("latin1") + data
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": descr, "fortran_order": False, "shape": shape})
+    return stream.getvalue() + data
 
 
 def rows(count: int = T) -> list[list[float]]:
@@ -57,10 +56,14 @@ def put_map(folder: Path, channels: list = CHANNELS, stem: str = "frame_00001", 
     np.save(folder / f"{stem}_s.npy", np.array(channels).astype(descr))
 
 
+def put(folder: Path, channels: list = CHANNELS, table: list[list[float]] | None = None, stem="frame_00001") -> None:
+    put_map(folder, channels, stem)
+    put_table(folder, rows() if table is None else table, stem)
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    put_map(tmp_path)
-    put_table(tmp_path, rows())
+    put(tmp_path)
     return tmp_path
 
 
@@ -112,8 +115,7 @@ def test_sum_adds_all_levels_up(folder):
     # Opposite vectors cancel
     table = rows()
     table[5] = [-value for value in table[0]]
-    put_map(folder, [DEFAULT, [[X] * 4] * 3, [[X] * 4] * 3, L])
-    put_table(folder, table)
+    put(folder, [DEFAULT, [[X] * 4] * 3, [[X] * 4] * 3, L], table)
     view = source(folder, "sum").view(IMAGE, NAME)
     assert (pixels(view)[:2, :2] == 0).all()
     assert (pixels(view)[:2, 2:3].norm(dim=2) > 0.99).all()
@@ -131,6 +133,12 @@ def test_maps_and_tables_of_every_type(folder):
     put_map(folder, [[[value % 256 for value in row] for row in c] for c in CHANNELS], descr="|u1")
     with pytest.warns(UserWarning, match=r"_s\.npy has ids past .*ids: 255; channels: 0, 1, 2, 3;"):
         assert_close(source(folder).view(IMAGE, NAME), expected(L))
+    # Half precision cannot hold ids beyond 2048
+    put_table(folder, rows(2100))
+    put_map(folder, [[[2050, 3]]], descr="<f2")
+    refused(lambda: source(folder).view(noise(1, 2), NAME), "_s.npy", "float16", "2048")
+    put_map(folder, [[[2050, 3]]])
+    assert source(folder).view(noise(1, 2), NAME).features.shape == (2, D)
 
 
 def test_rows_of_any_length_are_normalised(folder):
@@ -142,18 +150,8 @@ def test_rows_of_any_length_are_normalised(folder):
     assert_close(view, expected(L), 1e-6 + 5e-4)
     assert torch.equal(view.features[1], torch.tensor(table[6]))
     assert abs(float(view.features[0].double().norm()) - 1) < 1e-6
-
-
-def test_half_precision_ids_beyond_2048_are_refused(tmp_path):
-    put_table(tmp_path, rows(2100))
-    put_map(tmp_path, [[[2050, 3]]], descr="<f2")
-    refused(lambda: source(tmp_path).view(noise(1, 2), NAME), "_s.npy", "float16", "2048")
-    put_map(tmp_path, [[[2050, 3]]])
-    assert source(tmp_path).view(noise(1, 2), NAME).features.shape == (2, D)
-
-
-def test_one_channel_serves_every_level(folder):
-    """One channel, the same one four times, or a map without channels."""
+    # One channel, the same one four times, or a map without channels, serves every level
+    put_table(folder, rows())
     for level in (*LEVELS, "sum"):
         for channels in (1, 4):
             put_map(folder, [L] * channels)
@@ -166,8 +164,7 @@ def test_the_folder_may_be_doubled(tmp_path):
     for place in (".", "language_features", "language_features/language_features"):
         there = tmp_path / str(len(place)) / place
         there.mkdir(parents=True)
-        put_map(there)
-        put_table(there, rows())
+        put(there)
         assert_close(source(tmp_path / str(len(place))).view(IMAGE, NAME), expected(L))
 
 
@@ -195,18 +192,15 @@ def test_missing_frames_are_listed_and_refused_or_left_out(folder):
 
 
 def test_names_end_at_the_first_dot_or_the_last(folder):
-    put_map(folder, [S], stem="a")
-    put_table(folder, rows(), stem="a")
+    put(folder, [S], stem="a")
     assert_close(source(folder).view(IMAGE, "a.left.jpg"), expected(S))
-    put_map(folder, [M], stem="a.left")
-    put_table(folder, rows(), stem="a.left")
+    put(folder, [M], stem="a.left")
     assert_close(source(folder).view(IMAGE, "a.left.jpg"), expected(M))
     names = ["x/a.right.png", "a.jpg"]
     refused(lambda: source(folder).available(names), *names, "a_s.npy")
     # Paths in names lead nowhere else
     (folder / "inner").mkdir()
-    put_map(folder / "inner", stem="b")
-    put_table(folder / "inner", rows(), stem="b")
+    put(folder / "inner", stem="b")
     for name in ("inner/b.jpg", "../inner/b.jpg", str(folder / "inner" / "b.jpg"), "..", ""):
         refused(lambda name=name: source(folder).available([name]), "1 of 1", error=FileNotFoundError)
 
@@ -223,9 +217,8 @@ def test_what_names_no_row_counts_as_unlabelled(folder):
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             assert_close(source(folder).view(IMAGE, NAME), expected([[X, 5, 6, 6], *L[1:]]))
-        assert [f"(ids: {garbage}; channels: 3; pixels: 1)" in str(one.message) for one in told] == [True] * (
-            garbage != -7
-        )
+        assert len(told) == (garbage != -7)
+        assert all(f"(ids: {garbage}; channels: 3; pixels: 1)" in str(one.message) for one in told)
     put_map(folder)
     for wrong in (float("nan"), float("inf"), 0.0):
         table = rows()
@@ -239,8 +232,7 @@ def test_what_names_no_row_counts_as_unlabelled(folder):
         without = [[[X if value == 5 else value for value in row] for row in channel] for channel in CHANNELS]
         assert_close(view, torch.nn.functional.normalize(sum(expected(channel) for channel in without), dim=2))
     # An image without any mask
-    put_map(folder, [[[X] * WIDTH] * HEIGHT] * 4)
-    put_table(folder, [])
+    put(folder, [[[X] * WIDTH] * HEIGHT] * 4, [])
     for level in ("l", "sum"):
         view = source(folder, level).view(IMAGE, NAME)
         assert view.features.shape == (0, D) and (view.labels == -1).all()
@@ -252,9 +244,6 @@ def test_broken_files_are_named_before_the_lift(folder, tmp_path):
         ("s", npy("|O", (4,), b"\x80\x04N."), ["NPY", "objects"]),
         ("s", b"", ["NPY"]),
         ("s", npy("<f4", (3, 1, 1), b"\0" * 12), ["float32 (3, 1, 1)", "[4, H, W]"]),
-        ("s", npy("<U1", (4, 1, 1), b"\0" * 16), ["<U1"]),
-        ("s", npy("<f4", (4, 0, 1), b""), ["float32 (4, 0, 1)"]),
-        ("f", npy("<f4", (7, D), b"\0" * 100), ["NPY"]),
         ("f", npy("<f4", (7, 3), b"\0" * 84), ["float32 (7, 3)", "language_features_dim3"]),
         ("f", npy("<i4", (7, D), b"\0" * 28 * D), ["int32 (7, 512)"]),
     ):
@@ -262,8 +251,7 @@ def test_broken_files_are_named_before_the_lift(folder, tmp_path):
         (folder / f"frame_00001_{suffix}.npy").write_bytes(content)
         what = {"s": "segment map", "f": "feature table"}[suffix]
         refused(lambda: source(folder).available([NAME]), what, f"frame_00001_{suffix}.npy", *parts)
-    put_table(folder, rows())
-    put_map(folder, [DEFAULT, S, M, [L[0], [5, 5.5, 6, 6], L[2]]])
+    put(folder, [DEFAULT, S, M, [L[0], [5, 5.5, 6, 6], L[2]]])
     refused(lambda: source(folder).view(IMAGE, NAME), "_s.npy: channel 3, row 1, column 1", "5.5")
     put_map(folder)
     put_map(folder, stem="b")

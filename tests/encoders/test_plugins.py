@@ -76,10 +76,7 @@ def test_an_unknown_name_is_refused_with_those_known(tmp_path: Path, monkeypatch
     refused(lambda: check_source_options(SourceOptions(encoder="clip"), ()), *parts)
     assert find_encoder_kind("clip") is None and find_encoder_kind(3) is None
     refused(lambda: encoder_kind("same"), "'same'", "plug", "two", "uninstall")
-
-
-def test_of_two_copies_of_a_package_the_first_on_the_path_counts(tmp_path, monkeypatch):
-    for name in ("b", "a"):
+    for name in ("b", "a"):  # of two copies of a package the first on the path counts
         install(tmp_path / name, "twice", f"[normlift_ns.encoders]\n{name} = twice:ENCODER\n")
         monkeypatch.syspath_prepend(tmp_path / name)
     assert {"a", "b"} & set(ENCODERS.names()) == {"a"}
@@ -91,7 +88,6 @@ def test_a_broken_encoder_breaks_itself_only(tmp_path: Path) -> None:
         ("plug:KIND", "1 / 0", ["cannot be loaded", "ZeroDivisionError", "--encoder open_clip"]),
         ("plug:KIND", "raise SystemExit(3)", ["cannot be loaded", "SystemExit: 3"]),
         ("plug:KIND", "KIND = 3", ["plug:KIND", "int", "EncoderKind"]),
-        ("plug:", "", ["cannot be loaded"]),
     )):  # fmt: skip
         install(tmp_path / str(number), "worse", f"[{ENCODERS.group}]\nno value at all\n= = =\n[")
         with plugged(tmp_path / str(number), "plug", points(bad=value, open_clip="plug:KIND"), code):
@@ -117,7 +113,6 @@ def test_what_another_package_makes_is_checked(tmp_path: Path) -> None:
         ("torch.ones(2, 3)", "Wrong()", ["1.73"]),
         ("torch.eye(3)", "Wrong()", ["torch.float32 (3, 3)", "per region", "[2, D]"]),
         ("None", "Wrong()", ["NoneType", "per region"]),
-        ("torch.eye(2) / torch.zeros(1)", "Wrong()", ["expected 1"]),
         ("1 / 0", "Wrong()", ["'wrong'", "ZeroDivisionError"]),
         ("0", "object()", ["identity", "encode", "text"]),
         ("0", "missing", ["'wrong'", "NameError"]),

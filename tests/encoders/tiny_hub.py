@@ -1,6 +1,5 @@
 """Folders of SigLIP, SigLIP 2 and MetaCLIP 2, written by transformers; tests import this while they run."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,23 +9,12 @@ from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers,
 
 SIDE, PATCH, LENGTH, WIDTH = 32, 8, 16, 32
 """Of images, in pixels; of texts, in tokens; of vectors."""
-_WORDS = ("red", "mug", "table", "wine", "bottle", "a", "the", "on")
+_LETTERS = ("▁", *map(chr, range(33, 127)))
 _TINY = {"hidden_size": WIDTH, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
 
 
-def _pieces(special: Sequence[str], bytes_too: bool) -> tuple[dict[str, int], list[tuple[str, str]]]:
-    """Vocabulary and merges of byte pairs that know some words."""
-    letters = [chr(code) for code in range(33, 127)]
-    fallback = [f"<0x{code:02X}>" for code in range(256)] if bytes_too else []
-    names, merges = list(dict.fromkeys([*special, *fallback, "▁", *letters])), []
-    for word in _WORDS:
-        whole = ""
-        for part in (*word, "▁")[-1:] + tuple(word):
-            if whole and whole + part not in names:
-                names.append(whole + part)
-                merges.append((whole, part))
-            whole += part
-    return {name: number for number, name in enumerate(names)}, merges
+def _scores(*special: str) -> list[tuple[str, float]]:
+    return [(name, 0.0 if name in special else -19.0) for name in (*special, *_LETTERS)]
 
 
 def _ending(tokenizer: Any, end: str) -> None:
@@ -36,9 +24,7 @@ def _ending(tokenizer: Any, end: str) -> None:
 
 def siglip_tokenizer() -> Any:
     """Like the tokenizer.json of SigLIP, whose own class needs sentencepiece: </s> ends texts and fills them up."""
-    vocabulary, _ = _pieces(["<pad>", "</s>", "<unk>"], bytes_too=False)
-    scores = [(name, 0.0 if number < 3 else -20.0 + len(name)) for name, number in vocabulary.items()]
-    tokenizer = Tokenizer(models.Unigram(scores, unk_id=2, byte_fallback=False))
+    tokenizer = Tokenizer(models.Unigram(_scores("<pad>", "</s>", "<unk>"), unk_id=2, byte_fallback=False))
     tokenizer.normalizer = normalizers.Sequence([normalizers.Lowercase(), normalizers.Strip()])
     tokenizer.pre_tokenizer = pre_tokenizers.Metaspace()
     tokenizer.decoder = decoders.Metaspace()
@@ -50,18 +36,16 @@ def siglip_tokenizer() -> Any:
 
 def siglip2_tokenizer() -> Any:
     """The library's own Siglip2Tokenizer, which lowers texts."""
-    vocabulary, merges = _pieces(["<pad>", "<eos>", "<bos>", "<unk>", "<mask>"], bytes_too=True)
-    tokenizer = transformers.Siglip2Tokenizer(
-        vocab=vocabulary, merges=merges, padding_side="right", model_input_names=["input_ids"]
-    )
+    names = ("<pad>", "<eos>", "<bos>", "<unk>", "<mask>", *(f"<0x{code:02X}>" for code in range(256)), *_LETTERS)
+    vocabulary = {name: number for number, name in enumerate(names)}
+    how = {"padding_side": "right", "model_input_names": ["input_ids"]}
+    tokenizer = transformers.Siglip2Tokenizer(vocab=vocabulary, merges=[], **how)
     _ending(tokenizer.backend_tokenizer, "<eos>")
     return tokenizer
 
 
 def metaclip_tokenizer() -> Any:
-    vocabulary, _ = _pieces(["<s>", "<pad>", "</s>", "<unk>"], bytes_too=False)
-    scores = [(name, 0.0 if number < 4 else -20.0 + len(name)) for name, number in vocabulary.items()]
-    return transformers.XLMRobertaTokenizer(vocab=[*scores, ("<mask>", 0.0)])
+    return transformers.XLMRobertaTokenizer(vocab=[*_scores("<s>", "<pad>", "</s>", "<unk>"), ("<mask>", 0.0)])
 
 
 def _write(folder: Path, model: Any, processor: Any, seed: int) -> None:

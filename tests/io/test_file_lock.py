@@ -13,12 +13,10 @@ from hypothesis import strategies as st
 from normlift_ns.io import file_lock as module
 from normlift_ns.io.file_lock import (
     ABANDONED,
-    UNCLAIMED,
     Claim,
     ClaimState,
     append_jsonl,
     finish_claim,
-    is_claimable,
     iter_claims,
     read_claim_states,
     read_jsonl,
@@ -43,6 +41,15 @@ class Clock:
     def sleep(self, seconds: float) -> None:
         self.now += seconds
         self.meanwhile(self.now - self.begun)
+
+
+def taken(folder: Path, keys: list[str], clock: Clock) -> list[tuple[str, int, float]]:
+    """Claims that one takes and finishes, with their numbers and times."""
+    found = []
+    for mine in iter_claims(folder, keys, {}, PATIENCE, clock=clock, sleep=clock.sleep):
+        found.append((mine.key, mine.number, clock.now - clock.begun))
+        finish_claim(mine, "done")
+    return found
 
 
 def claimed(folder: Path) -> Claim:
@@ -73,13 +80,8 @@ def test_processes_share_work_of_which_each_piece_is_done_once(tmp_path):
 @pytest.mark.parametrize("skew", [-1e6, 0.0, 1e6])
 def test_the_work_of_a_dead_owner_is_taken_over_after_the_patience(tmp_path, skew):
     dead = claimed(tmp_path)
-    clock, taken = Clock(skew), []
-    for mine in iter_claims(tmp_path, ["a", "b"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
-        taken.append((mine.key, mine.number, clock.now - skew))
-        finish_claim(mine, "done")
-    assert taken[0] == ("b", 1, 0.0)
-    ((key, number, seconds),) = taken[1:]
-    assert (key, number) == ("a", 2) and PATIENCE <= seconds <= PATIENCE + 5
+    first, (key, number, seconds) = taken(tmp_path, ["a", "b"], Clock(skew))
+    assert first == ("b", 1, 0.0) and (key, number) == ("a", 2) and PATIENCE <= seconds <= PATIENCE + 5
     assert not write_pulse(dead, 1)  # which the dead one is told when it comes to life
 
 
@@ -90,23 +92,17 @@ def test_a_heartbeat_keeps_a_claim_until_it_stops(tmp_path):
         if seconds < 1000:
             assert write_pulse(other, int(seconds))
 
-    clock, taken = Clock(0.0, live), []
-    for mine in iter_claims(tmp_path, ["a"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
-        taken.append(clock.now)
-        finish_claim(mine, "done")
-    assert len(taken) == 1 and 1000 - 5 + PATIENCE <= taken[0] <= 1000 + PATIENCE + 5
+    ((_, _, seconds),) = taken(tmp_path, ["a"], Clock(0.0, live))
+    assert 1000 - 5 + PATIENCE <= seconds <= 1000 + PATIENCE + 5
 
 
-@pytest.mark.parametrize(("outcome", "taken"), [("done", 0), ("failed", 0), (ABANDONED, 1)])
-def test_what_another_ends_is_waited_for_and_only_what_was_left_is_taken(outcome, taken, tmp_path):
+@pytest.mark.parametrize("outcome", ["done", "failed", ABANDONED])
+def test_what_another_ends_is_waited_for_and_only_what_was_left_is_taken(outcome, tmp_path):
     other = claimed(tmp_path)
-    clock, found = Clock(0.0, lambda seconds: finish_claim(other, outcome)), []
-    for mine in iter_claims(tmp_path, ["a"], {}, PATIENCE, clock=clock, sleep=clock.sleep):
-        found.append(mine.number)
-        assert 0 < clock.now < PATIENCE / 6 + 5
-        finish_claim(mine, "done")
-    assert found == [2] * taken
-    assert clock.now < PATIENCE / 6 + 5
+    clock = Clock(0.0, lambda seconds: finish_claim(other, outcome))
+    found = taken(tmp_path, ["a"], clock)
+    assert [number for _, number, _ in found] == [2] * (outcome == ABANDONED)
+    assert 0 < clock.now < PATIENCE / 6 + 5
 
 
 def test_what_had_ended_before_is_tried_again_by_one(tmp_path):
@@ -146,14 +142,6 @@ def test_the_last_attempt_counts_in_whatever_order_files_are_listed(attempts, dr
     assert module.claim_states(names) == {
         key: ClaimState(len(outcomes), outcomes[-1]) for key, outcomes in attempts.items()
     }
-
-
-def test_what_is_free():
-    assert module.BEATS_PER_TIMEOUT == 6
-    assert is_claimable(UNCLAIMED, UNCLAIMED) and is_claimable(ClaimState(1, ABANDONED), UNCLAIMED)
-    assert is_claimable(ClaimState(2, "done"), ClaimState(2, "done"))
-    assert not any(is_claimable(ClaimState(2, outcome), ClaimState(1, outcome)) for outcome in ("done", "failed"))
-    assert not is_claimable(ClaimState(1, None), ClaimState(1, None))
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,8 @@
 """Cells and regions of images that are cut in several ways."""
 
 import numpy as np
-import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -16,6 +15,7 @@ SHAPES = st.tuples(st.integers(1, 5), st.integers(1, 6), st.integers(1, 6))
 
 
 @given(arrays(np.int32, SHAPES, elements=st.integers(-1, 3)))
+@example(np.array([[[-1, 0, 2]], [[-1, 3, -1]]], np.int32))
 def test_cells_are_the_sets_of_pixels_with_the_same_labels(values):
     maps = torch.from_numpy(values)
     cells, regions = joint_partition(maps)
@@ -44,31 +44,20 @@ MAPS = np.stack([np.repeat([[1, 1, 2, 2]], 4, 0), np.repeat([[1], [1], [0], [2]]
 IMAGE = noise(4, 4)
 
 
-@pytest.fixture
-def folder(tmp_path):
+def test_every_level_has_the_same_cells_and_its_own_features(tmp_path):
     np.save(tmp_path / "a.npy", MAPS)
-    return tmp_path
-
-
-def test_every_level_has_the_same_cells_and_its_own_features(folder):
-    views = [RegionFeatures(LabelFiles(folder, level=i), ColorEncoder()).view(IMAGE, "a.jpg") for i in range(3)]
+    views = [RegionFeatures(LabelFiles(tmp_path, level=i), ColorEncoder()).view(IMAGE, "a.jpg") for i in range(3)]
     assert all(torch.equal(view.labels, views[0].labels) for view in views)
     for level, view in enumerate(views):
-        alone = LabelFiles(folder).labels(IMAGE, "a.jpg")[level]
+        alone = LabelFiles(tmp_path).labels(IMAGE, "a.jpg")[level]
         assert torch.equal(view.region_of_cell[0, view.labels.long()], alone[0])
         assert torch.equal(view.features, ColorEncoder().encode(IMAGE, alone))
     assert views[2].features.shape[0] == 0
     for wrong in (None, 3):
-        source = RegionFeatures(LabelFiles(folder, level=wrong), ColorEncoder())
+        source = RegionFeatures(LabelFiles(tmp_path, level=wrong), ColorEncoder())
         refused(lambda source=source: source.view(IMAGE, "a.jpg"), "a.npy", "levels 0..2", "--level")
-
-
-def test_several_levels_at_once(folder):
-    class Two(LabelFiles):
-        chosen = (1, 0)
-
-    view = RegionFeatures(Two(folder), ColorEncoder()).view(IMAGE, "a.jpg")
-    one, zero = (RegionFeatures(LabelFiles(folder, level=i), ColorEncoder()).view(IMAGE, "a.jpg") for i in (1, 0))
+    two = type("Two", (LabelFiles,), {"chosen": (1, 0)})
+    (zero, one, _), view = views, RegionFeatures(two(tmp_path), ColorEncoder()).view(IMAGE, "a.jpg")
     assert torch.equal(view.features, torch.cat([one.features, zero.features]))
     offset = torch.where(zero.regions >= 0, zero.regions + len(one.features), -1)
     assert torch.equal(view.regions, torch.cat([one.regions, offset]))

@@ -13,7 +13,7 @@ from scipy import ndimage
 from normlift_ns.segmentation import mask_filtering, regions
 from normlift_ns.segmentation.mask_filtering import Suppression, mask_nms, masks_to_boxes, remove_small_regions
 from normlift_ns.segmentation.regions import stack_masks
-from tests.encoders.tiny import DEVICES, needs_cuda
+from tests.encoders.tiny import needs_cuda
 from tests.examples import examples
 
 
@@ -116,6 +116,9 @@ def test_a_gpu_finds_the_same():
     assert torch.equal(stack_masks(masks.cuda()).cpu(), stack_masks(masks))
     assert torch.equal(masks_to_boxes(masks.cuda()).cpu(), masks_to_boxes(masks))
     assert mask_nms(masks[:0].cuda(), scores[:0].cuda()).device.type == "cuda"
+    noise = np.random.default_rng(3).random((3, 60, 71))
+    for share in (0.1, 0.5, 0.9):
+        assert_right(noise < share, 20, "cuda")
 
 
 @given(masks=boxes_with_noise(), empty=st.booleans())
@@ -160,7 +163,7 @@ def clean_by_hand(mask: np.ndarray, least: int) -> tuple[list[np.ndarray], bool]
     return [pieces == i for i in range(1, len(piece)) if piece[i] == piece[1:].max()], small
 
 
-def assert_right(masks: np.ndarray, least: int, device: str = "cpu") -> tuple[np.ndarray, list[bool]]:
+def assert_right(masks: np.ndarray, least: int, device: str = "cpu") -> None:
     given = torch.from_numpy(masks).to(device)
     cleaned, changed = remove_small_regions(given, least)
     assert torch.equal(given.cpu(), torch.from_numpy(masks))  # is left alone
@@ -170,7 +173,6 @@ def assert_right(masks: np.ndarray, least: int, device: str = "cpu") -> tuple[np
         answers, expected = clean_by_hand(mask, least)
         assert any(np.array_equal(found, answer) for answer in answers)
         assert different == expected
-    return cleaned.cpu().numpy(), changed.tolist()
 
 
 @examples(25)
@@ -182,23 +184,11 @@ def assert_right(masks: np.ndarray, least: int, device: str = "cpu") -> tuple[np
 @example(masks=np.ones((2, 3, 4), dtype=bool), least=100)
 @example(masks=np.ones((1, 1, 1), dtype=bool), least=2)
 @example(masks=np.indices((3, 8, 8)).sum(axis=0) % 2 == 0, least=5)
+@example(masks=np.array([[[1, 1, 0], [0, 0, 0], [1, 1, 1]], [[1, 1, 1], [1, 0, 1], [1, 0, 1]]], bool), least=2)
 def test_any_masks(masks, least):
     assert_right(masks, least)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_noise_stripes_checkerboards_and_plain_masks(device):
-    g = np.random.default_rng(3)
-    for share in (0.002, 0.1, 0.4, 0.5, 0.6, 0.9, 0.998):
-        _, changed = assert_right(g.random((3, 60, 71)) < share, 20, device)
-        assert all(changed)
-    y, x = np.mgrid[:40, :47]
-    masks = [y % 2 == 0, x % 2 == 0, (x + y) % 2 == 0, y > 50, y >= 0, (y == 7) & (x == 9), (y == 39) & (x == 46)]
-    masks += [(y == 0) & (x == 0), (x + y) % 5 == 0, (x // 4 + y // 4) % 2 == 0, (y < 20) ^ ((y == 3) & (x > 44))]
-    for least in (2, 17, 41, 48, 100):
-        assert_right(np.stack(masks), least, device)
-    found, different = remove_small_regions(torch.zeros(0, 4, 5, dtype=torch.bool, device=device), 10)
-    assert found.shape == (0, 4, 5) and different.shape == (0,)
+    found, different = remove_small_regions(torch.from_numpy(masks[:0]), least)
+    assert found.shape == (0, *masks.shape[1:]) and different.shape == (0,)
 
 
 def test_chunks_and_a_gpus_components_change_nothing(monkeypatch):

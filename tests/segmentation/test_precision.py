@@ -1,15 +1,12 @@
 """SAM's network in other precisions, compiled and not, against transformers' own code in float64."""
 
-from typing import Any
-
 import pytest
 import torch
 
 from normlift_ns.encoders.open_clip_network import OpenClipEncoder
-from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.checkpoint import load_sam_checkpoint, resolve_precision
 from normlift_ns.segmentation.sam import MaskRules, SamMasks, SamNetwork, load_sam_network
-from tests.encoders.tiny import SIDE, needs_cuda, noise, refused
+from tests.encoders.tiny import SIDE, needs_cuda, noise
 
 POINTS = torch.rand(21, 2, generator=torch.Generator().manual_seed(3)) * SIDE
 BOUNDS = {"float32": 2e-6, "float16": 8e-3, "bfloat16": 4e-2}
@@ -50,9 +47,7 @@ def test_answers_in_each_precision(checkpoint, embedding, expected):
         found = load_sam_network(str(checkpoint), "cpu", precision).decode(embedding, POINTS)
         close(found, expected, bound)
         assert found[0].dtype == getattr(torch, precision) and found[1].dtype == torch.float32
-
-
-def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding):
+    # Overflow in float16 is answered in float32
     network = load_sam_network(str(checkpoint), "cpu", "float16")
     huge = 1e6 * embedding  # beyond float16
     masks, ious = network.decode(huge, POINTS)
@@ -60,13 +55,12 @@ def test_overflow_in_float16_is_answered_in_float32(checkpoint, embedding):
     close((masks, ious), by_transformers(str(checkpoint), huge, torch.float64), 1e-4)
 
 
-def test_precision_is_part_of_the_identity_and_rules_find_masks(checkpoint):
-    sam = SamMasks(str(checkpoint))
-    assert resolve_precision("auto", "cpu") == "float32" and resolve_precision("auto", "cuda") == "float16"
-    assert sam.identity == SamMasks(str(checkpoint), precision="float32").identity
-    assert sam.identity != SamMasks(str(checkpoint), precision="bfloat16").identity
-    wrong: Any = "half"
-    refused(lambda: SourceOptions(sam_precision=wrong), "'half'", "sam_precision", "auto, float32")
+def test_precision_is_that_of_the_device_and_rules_find_masks(checkpoint):
+    for device, auto in (("cpu", "float32"), ("cuda", "float16"), ("mps", "float32")):
+        assert resolve_precision("auto", device) == auto and resolve_precision("float16", device) == "float16"
+    assert SamMasks(str(checkpoint)).identity == SamMasks(str(checkpoint), precision="float32").identity
+    sizes = [OpenClipEncoder(device=device)._crops.batch_size for device in ("mps", "cpu", "cuda")]
+    assert sizes == [8, 8, 128]
     rules = MaskRules(points_per_side=3, predicted_iou=-9.0, stability=0.01)
     labels = SamMasks(str(checkpoint), precision="bfloat16", rules=rules).labels(noise(60, 80), "")
     assert labels.shape[0] == 4 and int(labels.max()) >= 0
@@ -77,8 +71,3 @@ def test_a_gpu_gives_the_same_answers(checkpoint, embedding, expected):
     for precision, bound in {**BOUNDS, "float32": 1e-4}.items():
         network = SamNetwork(load_sam_checkpoint(str(checkpoint))[1], "cuda", precision)
         close(network.decode(embedding.cuda(), POINTS), expected, bound)
-
-
-def test_other_devices_get_the_settings_of_the_cpu() -> None:
-    assert resolve_precision("auto", "mps") == "float32" and resolve_precision("float16", "mps") == "float16"
-    assert OpenClipEncoder(device="mps")._crops.batch_size == OpenClipEncoder()._crops.batch_size
