@@ -156,7 +156,7 @@ def test_quick_grid(tmp_path):
     flags = ("--rows", str(tmp_path / "rows.jsonl"))
     command = [sys.executable, "-m", "research.grid", "--quick", *flags, "--minutes", "0"]
     begun = subprocess.run([*command, "--output", tmp_path], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert begun.returncode == 1 and "no cell is done" in begun.stderr
+    assert begun.returncode == 1 and "no cell is finished" in begun.stderr
     values = quick("grid", tmp_path, *flags)
     assert values["cells"]["value"] == 12 and any(key.startswith("decision.default.") for key in values)
     assert quick("grid", tmp_path, *flags) == values  # from the rows
