@@ -155,7 +155,7 @@ def test_votes_are_those_of_refine(world):
 def test_quick_grid(tmp_path):
     flags = ("--rows", str(tmp_path / "rows.jsonl"))
     command = [sys.executable, "-m", "research.grid", "--quick", *flags, "--minutes", "0"]
-    assert "no cell is done" in run(*command, "--output", tmp_path, code=1, cwd=ROOT)
+    assert "no cell is finished" in run(*command, "--output", tmp_path, code=1, cwd=ROOT)
     values = quick("grid", tmp_path, *flags)
     assert values["cells"]["value"] == 12 and any(key.startswith("decision.default.") for key in values)
     assert quick("grid", tmp_path, *flags) == values  # from the rows
