@@ -127,19 +127,13 @@ def unchecked() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _gradients() -> Iterator[None]:
-    """Fails a test that leaves gradients disabled, which would break the next test that trains."""
+def _tidy(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fails a test that leaves one of its files open, or gradients disabled, which would break others that train."""
     yield
+    folder = request.node.funcargs.get("tmp_path")
     if not torch.is_grad_enabled():
         torch.set_grad_enabled(True)
         pytest.fail("gradients are disabled after this test")
-
-
-@pytest.fixture(autouse=True)
-def _closed(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Fails a test that leaves one of its own files open."""
-    yield
-    folder = request.node.funcargs.get("tmp_path")
     if folder is not None and _open_files(folder):
         gc.collect()  # an exception and its frames hold what they have read
         assert _open_files(folder) == [], "files left open"

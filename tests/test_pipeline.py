@@ -327,17 +327,14 @@ def test_the_gate_is_measured_after_a_consensus_and_fixed_by_options(
     manifest, config = voted(vote=nl.RefineConfig(k=5, tau=0.9, gamma=0.05, min_labeled=0.0), recognition=False)
     assert config.numbers == VOTE_DEFAULTS["posterior"]._replace(min_labeled=0.0)  # version 0.2
     assert {"gate", "recognition"}.isdisjoint(manifest["statistics"])
+    assert min_agreement(nl.LiftOptions(), source.identity) == 0.4
+    for identity in ({"regions": {"kind": "edges"}}, {"kind": "langsplat"}):  # regions that are objects
+        assert min_agreement(nl.LiftOptions(), identity) == 0
+        assert min_agreement(nl.LiftOptions(consensus_min_agreement=0.3), identity) == 0.3
     paper = {"vote": nl.RefineConfig(vote="paper", k=5)}
     for options in ({"consensus": False}, {"consensus_min_agreement": 1.0}, paper):
         manifest, config = voted(**options)
         assert "gate" not in manifest["statistics"] and config.numbers == VOTE_DEFAULTS[config.vote]
-
-
-def test_regions_that_are_objects_need_no_agreement(tmp_path: Path) -> None:
-    assert min_agreement(nl.LiftOptions(), halves(tmp_path / "maps").identity) == 0.4
-    for identity in ({"regions": {"kind": "edges"}}, {"kind": "langsplat"}):
-        assert min_agreement(nl.LiftOptions(), identity) == 0
-        assert min_agreement(nl.LiftOptions(consensus_min_agreement=0.3), identity) == 0.3
 
 
 def test_reliabilities_of_pairs_of_views_are_stored_and_leave_the_vote_alone(tmp_path: Path) -> None:

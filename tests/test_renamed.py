@@ -82,11 +82,8 @@ def test_commands_have_old_flags(command, capsys):
         parse_flags(command, [*needed, "--no-check"])
 
 
-def test_every_option_of_version_0_2_is_tried():
+def test_functions_have_old_keywords_and_every_option_of_version_0_2_is_tried():
     assert set(VALUES) == {old for options in OPTIONS for old in options.old_names}
-
-
-def test_functions_have_old_keywords():
     run, open_run = nl.LiftedRun, {"text_vectors": "a", "text_template": "b"}
     old = {nl.open_run: open_run, nl.lift_run: {"check": False}, run.ask: {"rule": "lerf"}}
     old |= {run.export: {"reach": 1.0, "min_size": 2}, run.catalogue: {"metres_per_unit": 1.0}}

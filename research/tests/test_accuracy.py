@@ -86,8 +86,7 @@ def test_rows_and_their_summary(world):
         for name, damage in (damages | {"mild, 3 views": replace(LADDER["mild"], views=3)}).items():
             found = bench.run(damage, seed, others=name in LADDER)
             rows.append({"scene": "tiny", "damage": name, "seed": seed, **found})
-    report = Report("accuracy")
-    summarize(rows, report)
+    summarize(rows, report := Report("accuracy"))
     values = {metric.key: metric.value for metric in report.metrics}
     ladder = [row for row in rows if row["damage"] in ("mild", "noise only")]
     three = [row for row in rows if row["damage"] == "mild, 3 views"]

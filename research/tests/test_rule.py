@@ -29,14 +29,11 @@ def some(count, loss, gain=3.0, cells=CELLS, chosen=lambda cell: True):
     return lambda cell: -loss if cell in struck else gain
 
 
-def test_the_best_mean_of_the_eligible_wins():
+def test_the_best_mean_wins_a_tie_goes_to_the_simpler_and_none_is_the_fallback():
     found = decide(table(one=1.0, two=2.0), NAMES)
     assert (found.default, found.choice, found.confirmed) == ("two", "two", None)
     assert found.verdicts["two"].gain == pytest.approx(2) and found.verdicts["two"].mean == pytest.approx(52)
     assert found.verdicts["none"].gain == 0 and found.verdicts["none"].eligible
-
-
-def test_a_tie_goes_to_the_simpler_and_none_is_the_fallback():
     assert decide(table(one=2.0, two=2.0), NAMES).default == "one"
     assert decide(table(one=0.0, two=0.0), NAMES).default == "none"
     assert decide(table(one=-0.1, two=-0.1), NAMES).default == "none"

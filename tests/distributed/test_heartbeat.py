@@ -12,7 +12,7 @@ import pytest
 from torch.distributed import HashStore
 
 from normlift_ns.distributed import heartbeat, launch
-from normlift_ns.distributed.heartbeat import HEARTBEAT_TIMEOUT, Heartbeat, PeerFailure
+from normlift_ns.distributed.heartbeat import HEARTBEAT_TIMEOUT, Heartbeat
 from normlift_ns.distributed.launch import rank_and_world_size
 from normlift_ns.errors import InputError
 
@@ -42,10 +42,7 @@ class World:
 
     def __init__(self) -> None:
         self.store, self.hearts, self.now = Store(), [], 0.0
-        self.signals: list[int] = []
-        self.exits: list[int] = []
-        self.words: list[PeerFailure] = []
-        self.threads: list[threading.Thread] = []
+        self.signals, self.exits, self.words, self.threads = [], [], [], []
 
     def team(self, size: int) -> list[Heartbeat]:
         self.hearts = [Heartbeat(self.store, rank, size, self.words.append) for rank in range(size)]

@@ -29,26 +29,23 @@ def test_every_format_has_the_gaussians_of_the_run(lifted: Path, tmp_path: Path,
     for name in files:
         if name[0] != "a":
             rows = run.export(tmp_path / name, answer)
-            assert np.array_equal(rows, np.load(_beside(tmp_path / name, "rows.npy")))
+            assert np.array_equal(rows, np.load(tmp_path / f"{Path(name).stem}_rows.npy"))
     with pytest.raises(InputError, match=r"e\.sog is not written: .* \.glb, \.spz"):
         run.export(tmp_path / "e.sog", answer)
     with pytest.raises(FileExistsError):
         run.export(tmp_path / "b.spz", answer)
     run.export(tmp_path / "b.spz", answer, overwrite=True)
     for name, limit in files.items():
-        rows = np.load(_beside(tmp_path / name, "rows.npy"))
+        stem = Path(name).stem
+        rows, names = np.load(tmp_path / f"{stem}_rows.npy"), (tmp_path / f"{stem}_names.json").read_text()
         assert set(rows) <= set(answer.mask.nonzero()[:, 0].tolist())
-        assert json.loads(_beside(tmp_path / name, "names.json").read_text())["class_id"] == {"1": "red", "2": "yellow"}
+        assert json.loads(names)["class_id"] == {"1": "red", "2": "yellow"}
         file = _read(tmp_path / name)
         assert file.rasterize_mode in (None, scene.rasterize_mode)
         assert len(file.splat) == len(rows) > 100
         assert float((file.splat.means - trained["means"][rows]).abs().max()) <= limit
         opacities = scene.gaussians.opacities[rows]
         assert float((file.splat.activated.opacities - opacities).abs().max()) < 0.002
-
-
-def _beside(path: Path, end: str) -> Path:
-    return path.with_name(f"{path.stem}_{end}")
 
 
 def test_a_glb_file_has_labels_and_their_names(lifted: Path, tmp_path: Path) -> None:

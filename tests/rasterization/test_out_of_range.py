@@ -32,13 +32,11 @@ def without_gsplat(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
 
 
+MORE = [("classic", "1.4"), ("classic", "1.5"), ("antialiased", "1.5")]
+
+
 @pytest.mark.parametrize(
-    ("mode", "rules"),
-    [
-        ("antialiased", "1.4"),
-        *(pytest.param(*x, marks=pytest.mark.extra) for x in (("classic", "1.4"), ("classic", "1.5"))),
-        pytest.param("antialiased", "1.5", marks=pytest.mark.extra),
-    ],
+    ("mode", "rules"), [("antialiased", "1.4"), *(pytest.param(*x, marks=pytest.mark.extra) for x in MORE)]
 )
 @pytest.mark.usefixtures("without_gsplat")
 def test_the_gpu_backend_leaves_out_and_draws_the_same(mode, rules):
