@@ -84,11 +84,10 @@ class OnPage(Person):
 
     def prepare(self) -> None:
         """Keeps what the browser complains about, and addresses of other servers."""
-        self.page.on(
-            "console", lambda line: self.problems.append(line.text) if "Content Security" in line.text else None
-        )
+        note = self.problems.append
+        self.page.on("console", lambda line: note(line.text) if "Content Security" in line.text else None)
         local = ("http://127.0.0.1", "ws://127.0.0.1", "blob:", "data:")
-        self.page.on("request", lambda one: None if one.url.startswith(local) else self.problems.append(one.url))
+        self.page.on("request", lambda one: None if one.url.startswith(local) else note(one.url))
 
     def ready(self) -> None:
         self.until(lambda: self.page.evaluate("window.page?.state?.details ?? false"), "a state")

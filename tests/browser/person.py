@@ -135,13 +135,13 @@ class Person:
     """What the page says once the picture is as fine as it gets, a pattern."""
 
     def __init__(self, browser: Browser, address: str, size: tuple[int, int], *, webgl: bool = True) -> None:
+        self.size, self.problems = size, []
         self.context = browser.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
         self.context.set_default_timeout(1000 * PATIENCE)
         self.page: Page = self.context.new_page()
         self.prepare()
         if not webgl:
             self.page.add_init_script(_BLIND)
-        self.size, self.problems = size, []
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
         self.page.goto(address, wait_until="domcontentloaded")
         self.button("Ask").wait_for()

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
 TITLE = 52
 """Height of the title bar in pixels."""
-HIDDEN = "Gaussians are hidden"
-"""What the panel says while something is."""
 
 
 class Tab(Person):

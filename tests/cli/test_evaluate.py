@@ -22,11 +22,6 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def capture(little_lifted: Path) -> Path:
-    return little_lifted.parents[4] / "room"
-
-
-@pytest.fixture
 def scored(little_lifted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
     def score(protocol: str, labels: Path, *flags: object) -> dict:
@@ -49,14 +44,14 @@ def test_coverage_needs_no_truth(little_lifted, tmp_path, monkeypatch, capsys):
     pictures = {f"next_coverage_pose_{i}.png" for i in range(1, len(found["poses"]) + 1)}
     path = {"next_coverage_camera_path.json"} if len(pictures) > 0 else set()
     assert {path.name for path in tmp_path.iterdir()} == {"next.json"} | pictures | path
-    shown = said(capsys)
-    assert "photographs" in shown and "next.json" in shown
+    assert "next.json" in said(capsys)
 
 
-def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch, capsys):
+def test_masks_of_a_capture_with_studies(scored, little_lifted, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(studies, "SWEEPS", {"beta": (0.5,), "k": (6, 12), "delta": (0.0, 0.1)})
     flags = ("--study", "ablation", "sweeps", "signals", "timing", "baselines")
-    document = scored("masks", capture / "instance", *flags)
+    labels = little_lifted.parents[4] / "room" / "instance"
+    document = scored("masks", labels, *flags)
     results, tables = document["results"], document["studies"]
     told = said(capsys)
     assert all(word in told for word in ("miou_3d", "spearman_bins", "drsplat", "Splat Feature Solver"))
@@ -65,7 +60,7 @@ def test_masks_of_a_capture_with_studies(scored, capture, tmp_path, monkeypatch,
     assert results["miou_3d"] > 0.5 and results["miou_2d"] > 0.4
     assert 0.5 < results["gaussians_with_truth_share"] < 1
     assert len(document["rows"]) == 13 and document["settings"]["held_out_views"] == 2
-    plain = scored("masks", capture / "instance", "--refined", False)["results"]
+    plain = scored("masks", labels, "--refined", False)["results"]
     assert plain["miou_3d"] != results["miou_3d"]
 
     assert list(tables) == ["ablation", "sweeps", "signals", "timing", "baselines"]
@@ -108,10 +103,11 @@ def write_polygons(folder: Path, instance: Path, names: tuple[str, ...]) -> None
     (folder / f"{instance.stem}.json").write_text(json.dumps({"info": info, "objects": objects}))
 
 
-def test_lerf_with_stand_in_words(scored, little_lifted, little_room, capture, tmp_path, monkeypatch, capsys):
+def test_lerf_with_stand_in_words(scored, little_lifted, little_room, tmp_path, capsys):
     labels, hall = tmp_path / "label" / "ramen", tmp_path / "label" / "hall"
     for folder, stem in ((labels, "0000"), (labels, "0006"), (hall, "0000")):  # 0006 is held out
-        write_polygons(folder, capture / "instance" / f"{stem}.png", little_room.names)
+        instance = little_lifted.parents[4] / "room" / "instance" / f"{stem}.png"
+        write_polygons(folder, instance, little_room.names)
     (labels / "0099.json").write_text((labels / "0000.json").read_text())
     words = {**{name: name for name in WANTED}, **dict.fromkeys(BACKGROUND_WORDS, "cream")}
     words |= {"floor": "light brown", "object": "chocolate brown", "things": "grey"}

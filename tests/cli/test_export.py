@@ -1,4 +1,5 @@
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +30,8 @@ def scene_ply(lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_file_is_that_of_ns_export_and_more(scene_ply, lifted, nerfstudio, ns_export, monkeypatch, tmp_path):
     from normlift_ns.method_configs.normlift import normlift_method  # noqa: PLC0415
 
-    setup = ns_export.eval_setup
-
-    def spoiled(config: Path, **options):
-        config, pipeline, *rest = setup(config, update_config_callback=lambda c: relocate_config(c, lifted), **options)
-        return config, pipeline, *rest
-
-    monkeypatch.setattr(ns_export, "eval_setup", spoiled)
+    moved = partial(ns_export.eval_setup, update_config_callback=lambda config: relocate_config(config, lifted))
+    monkeypatch.setattr(ns_export, "eval_setup", moved)
     monkeypatch.setitem(nerfstudio.all_methods, "normlift", normlift_method.config)
     ns_export.ExportGaussianSplat(load_config=lifted, output_dir=tmp_path).main()
     theirs, ours = (PlyData.read(path)["vertex"] for path in (tmp_path / "splat.ply", scene_ply))

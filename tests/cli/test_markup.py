@@ -88,11 +88,6 @@ def test_a_prompt_of_markup_is_asked_and_answered(lifted, tmp_path, monkeypatch,
         assert escape_unprintable(text) in shown
     assert f"{folder}/a.json" in shown
     assert len(list(folder.glob("*.png"))) == len(texts)
-    texts = (*texts, "blue $\\frac{$")
-    exported = ("--load-config", lifted, "--output-dir", folder / "ply", "--text", *texts)
-    assert run_entry(monkeypatch, export.entrypoint, *exported) == 0
-    shown = capsys.readouterr().out
-    assert all(escape_unprintable(text) in shown for text in texts)
 
 
 def test_answers_and_reasons_fit_into_the_terminal_with_all_their_numbers():

@@ -6,7 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from normlift_ns.cli import evaluate, export, lift, query, serve, view
+from normlift_ns.cli import check, evaluate, export, lift, query, serve, view
 from normlift_ns.data.nerfstudio.config import read_config_paths
 from normlift_ns.encoders import open_clip
 from tests.cli.conftest import run_entry, said
@@ -78,7 +78,6 @@ LIFT = [
     ("--encoder open_clip --encoder-pretrained missing.pt", "missing.pt"),
     (("--queries", "red", " "), "prompt 2 of 2 in --queries"),
     ("--consensus False --consensus-power 2", "--consensus-power has no effect without --consensus True"),
-    ("--consensus False --consensus-sample 9", "--consensus-sample has no effect without --consensus True"),
     ("--consensus False --consensus-min-agreement 0", "--consensus-min-agreement has no effect without --consensus"),
     ("--vote paper --vote-prior 2", "--vote-prior has no effect without --vote posterior"),
     ("--consensus-power 2 --vote posterior --vote-prior 2 --queries oragne", "oragne"),
@@ -100,6 +99,7 @@ SPLATS = [
     ("--load-config config.yml --colmap x", "--colmap", "--load-ply and --load-gsplat"),
     ("--load-config config.yml --background white", "--background", "--load-ply"),
 ]
+CHECK = [("--output-json mine/answers.json", "answers.json exists", "--output-json", "--overwrite True")]
 QUERY = [
     ("--text", "--text", "--interactive"),
     ("--text a --load-config no.yml", "no.yml"),
@@ -162,7 +162,6 @@ EVAL = [
     *((f"{STUDIES}/{x[0]}.json", f"{x} exists", "--output-path", "--overwrite True") for x in MY_SCORES),
     ("--protocol masks --labels none", "none, given with --labels"),
     ("--protocol lerf --labels none", "none, given with --labels"),
-    ("--protocol scannet --labels none", "none, given with --labels"),
     ("--protocol masks --labels room --purity nan", "--purity must be in 0..1, got nan"),
     ("--protocol masks --labels room --names none", "none, given with --names"),
     ("--protocol masks --labels room --output-path file/x", "--output-path is"),
@@ -188,6 +187,7 @@ SERVE = [("", "No run is given", "ns-normlift-serve RUN/config.yml"), ("nowhere/
     [
         pytest.param(lift, ("--load-config", "CONFIG", *COLOUR), LIFT, id="lift"),
         pytest.param(lift, COLOUR, SPLATS, id="splat"),
+        pytest.param(check, ("--load-config", "CONFIG", *COLOUR), CHECK, id="check"),
         pytest.param(query, ("--load-config", "CONFIG"), QUERY, id="query"),
         pytest.param(export, ("--load-config", "CONFIG", "--output-dir", "out"), EXPORT, id="export"),
         pytest.param(evaluate, ("--load-config", "CONFIG"), EVAL, id="eval"),
@@ -208,12 +208,11 @@ def test_a_mistake_is_told_early_and_leaves_nothing(command, given, cases, confi
         assert sorted(tmp_path.rglob("*")) == before, flags
 
 
-@pytest.mark.parametrize("command", [query, view])
-def test_a_run_that_is_not_lifted_is_told(command, config, monkeypatch, capsys):
-    text = ("--text", "a") if command is query else ()
+def test_a_run_that_is_not_lifted_is_told(config, monkeypatch, capsys):
     (config.parent / "normlift").rmdir()
-    assert run_entry(monkeypatch, command.entrypoint, "--load-config", config, *text) == 1
-    assert "run without semantics" in said(capsys)
+    for command, text in ((query, ("--text", "a")), (view, ())):
+        assert run_entry(monkeypatch, command.entrypoint, "--load-config", config, *text) == 1
+        assert "run without semantics" in said(capsys)
 
 
 def test_a_dataset_that_is_gone_is_refused_early(config, tmp_path, monkeypatch, capsys):

@@ -3,12 +3,7 @@
 `train_splatfacto` takes nerfstudio's registered configuration and runs `Trainer.setup()` and `Trainer.train()`; they
 write config.yml, dataparser_transforms.json and the checkpoint (optimizers, schedulers with numpy scalars, LPIPS).
 What splatfacto cannot do without a GPU, internet or system libraries is replaced while it trains (`splatfacto_on_cpu`):
-
-* gsplat.rasterization: normlift_ns' reference rasterizer, which autograd differentiates;
-* Tensor.cuda: the identity;
-* torchmetrics' LPIPS, which downloads AlexNet: a small network of our own;
-* open3d, which needs system libraries, for reading the seed points;
-* torch.compile: eager, as compiling takes longer than the training.
+gsplat by our reference rasterizer, which autograd differentiates, LPIPS, which downloads AlexNet, by a small network.
 """
 
 import json

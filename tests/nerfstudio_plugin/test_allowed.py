@@ -212,9 +212,6 @@ def test_damage_is_a_message(tmp_path: Path, texts: tuple[str, str]) -> None:
         fuzz(5, damaged(text.encode()), path, lambda: read(path))
 
 
-HEADER = "!!python/object:nerfstudio.engine.trainer.TrainerConfig\nmethod_name: splatfacto\n"
-
-
 def test_a_config_of_another_operating_system_is_read(stock: StockRun, tmp_path: Path) -> None:
     path = tmp_path / "config.yml"
     path.write_text(stock.config.read_text().replace("pathlib.PosixPath", "pathlib.WindowsPath"))
@@ -252,6 +249,7 @@ def test_other_files_are_refused(stock: StockRun, tmp_path: Path) -> None:
 
 
 def test_a_config_runs_no_code(tmp_path: Path) -> None:
+    header = "!!python/object:nerfstudio.engine.trainer.TrainerConfig\nmethod_name: splatfacto\n"
     for value in (
         "object/apply:os.system ['touch hacked']",
         "object/new:os.system ['touch hacked']",
@@ -261,7 +259,7 @@ def test_a_config_runs_no_code(tmp_path: Path) -> None:
         "module:os ''",
     ):
         with working_directory(tmp_path):
-            assert "line 3" in refusal(tmp_path, f"{HEADER}data: !!python/{value}\n")
+            assert "line 3" in refusal(tmp_path, f"{header}data: !!python/{value}\n")
 
 
 def test_files_are_found_from_the_place_of_the_config(stock: StockRun, copied: Path, tmp_path: Path) -> None:

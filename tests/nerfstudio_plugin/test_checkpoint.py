@@ -78,12 +78,8 @@ def test_a_missing_checkpoint_is_named(copied: Path, tmp_path: Path) -> None:
     assert find_checkpoint(tmp_path).name == "step-000000001.ckpt"  # the others only look like checkpoints
 
 
-def test_cut_files_and_flipped_bits_are_noticed_or_change_nothing(full: Path, tmp_path: Path) -> None:
+def test_flipped_bits_are_noticed_or_change_nothing(full: Path, tmp_path: Path) -> None:
     path, expected, whole = tmp_path / NAME, read_checkpoint(full).model, full.read_bytes()
-    for share in (0.0, 0.5, 0.999):
-        path.write_bytes(whole[: int(len(whole) * share)])
-        with pytest.raises(ValueError, match=rf"{NAME} is truncated .* {int(len(whole) * share):,} bytes"):
-            read_checkpoint(path)
     noticed = 0
     for bit in random.Random(0).sample(range(8 * len(whole)), 40):
         path.write_bytes(flipped(whole, bit))

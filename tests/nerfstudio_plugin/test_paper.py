@@ -17,7 +17,6 @@ from normlift_ns.options import BACKGROUND_WORDS, SourceOptions
 from tests.cli.conftest import run_entry, said
 from tests.nerfstudio_plugin.stock_run import FOCAL, HEIGHT, WIDTH, pose, train_splatfacto, write_dataset
 
-PAGE = (Path(__file__).parents[2] / "docs" / "paper.md").read_text("utf8")
 WORDS = tuple(dict.fromkeys((*NYU40.values(), *BACKGROUND_WORDS)))
 
 
@@ -62,7 +61,8 @@ def test_scannet(tmp_path: Path, monkeypatch, capsys) -> None:
     scene, output = tmp_path / "scannet" / "scene0000_00", tmp_path / "o.json"
     features, vectors = scene / "language_features", scene / "names.npz"
     write_scene(scene)
-    (script,) = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
+    page = (Path(__file__).parents[2] / "docs" / "paper.md").read_text("utf8")
+    (script,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
     (tmp_path / "scannet_transforms.py").write_text(script)
     monkeypatch.setattr("sys.argv", ["scannet_transforms.py", str(scene)])
     runpy.run_path(str(tmp_path / "scannet_transforms.py"))

@@ -32,7 +32,8 @@ def field_with(settings: dict[str, Any], features: dict[str, Any]) -> SemanticFi
     return replace(field, manifest={**field.manifest, "encoder": settings, "features": features})
 
 
-def lifted(kind: str, tmp_path: Path) -> SemanticField:
+@pytest.mark.parametrize("kind", ["regions", "langsplat", "version 0.1"])
+def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "w.pt"
     path.write_bytes(b"weights" * 1000)
     source = SourceOptions(encoder_pretrained=str(path))
@@ -43,12 +44,7 @@ def lifted(kind: str, tmp_path: Path) -> SemanticField:
         "regions": {"regions": {"kind": "grid"}, "levels": [], "encoder": identity},
         "langsplat": {"kind": "langsplat", "level": "l", "texts": identity},
     }
-    return field_with(encoder_settings(source), features.get(kind, features["regions"]))
-
-
-@pytest.mark.parametrize("kind", ["regions", "langsplat", "version 0.1"])
-def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
-    path, field = tmp_path / "w.pt", lifted(kind, tmp_path)
+    field = field_with(encoder_settings(source), features.get(kind, features["regions"]))
     encoder = text_encoder_for(field, cache=tmp_path / "texts")
     assert isinstance(encoder, CachedTextEncoder)
     content = bytearray(path.read_bytes())
@@ -58,7 +54,7 @@ def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
     os.utime(path, ns=(stamps.st_atime_ns, stamps.st_mtime_ns))  # as old and as large as before
     with pytest.raises(InputError) as caught:
         text_encoder_for(field, cache=tmp_path / "texts")
-    expected = field.manifest["features"].get("encoder", field.manifest["features"].get("texts"))["pretrained"]
+    expected = identity["pretrained"]
     for part in (str(path), file_digest(path, compare_to=expected), expected, "--text-embeddings", "lift again"):
         assert part in str(caught.value)
     assert "--encoder-pretrained" not in str(caught.value)  # ns-normlift-query has no such flag
@@ -70,9 +66,8 @@ def test_replaced_weights_are_refused(kind: str, tmp_path: Path) -> None:
         text_encoder_for(field)
     assert "--encoder-pretrained" not in str(missing.value)
     np.savez(tmp_path / "own.npz", fox=np.ones(12, np.float32))  # the user's choice needs no weights
-    assert isinstance(
-        text_encoder_for(with_text_source(field, text_embeddings=tmp_path / "own.npz")), TextEmbeddingFile
-    )
+    own = with_text_source(field, text_embeddings=tmp_path / "own.npz")
+    assert isinstance(text_encoder_for(own), TextEmbeddingFile)
 
 
 def test_relative_paths_are_stored_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,9 +99,8 @@ def test_a_relative_path_of_version_0_1_finds_the_same_file_or_none(tmp_path, mo
 
 def test_a_file_that_is_called_like_the_tag_is_not_taken_for_it(tmp_path, monkeypatch) -> None:
     tag = SourceOptions().encoder_pretrained
-    field = field_with(
-        encoder_settings(SourceOptions("open_clip")), {"encoder": {"kind": "open_clip", "pretrained": tag}}
-    )
+    features = {"encoder": {"kind": "open_clip", "pretrained": tag}}
+    field = field_with(encoder_settings(SourceOptions("open_clip")), features)
     text_encoder_for(field)
     monkeypatch.chdir(tmp_path)
     Path(tag).write_bytes(b"weights")
@@ -132,7 +126,6 @@ def test_replaced_text_vectors_are_refused_unless_they_are_chosen(tmp_path: Path
 def test_features_of_version_0_1_may_say_nothing_of_the_encoder(tmp_path: Path) -> None:
     np.savez(tmp_path / "t.npz", fox=np.ones(12, np.float32))
     for features in ({}, {"kind": "given", "content": "0"}, {"encoder": 3}, {"encoder": {"pretrained": None}}):
-        assert isinstance(
-            text_encoder_for(field_with(precomputed_settings(str(tmp_path / "t.npz")), features)), TextEmbeddingFile
-        )
+        given = field_with(precomputed_settings(str(tmp_path / "t.npz")), features)
+        assert isinstance(text_encoder_for(given), TextEmbeddingFile)
         text_encoder_for(field_with(encoder_settings(SourceOptions("open_clip")), features))

@@ -45,13 +45,9 @@ class Images(list):
         return SimpleNamespace(image=torch.full((12, 16, 3), 60, dtype=torch.uint8))
 
 
-class OneRun:
-    def __init__(self, served: ServedRun) -> None:
-        self.ids, self.get = [served.id], lambda name: served
-
-
 def make_server(served: ServedRun, **options: Any) -> WarmServer:
-    return WarmServer(OneRun(served), ServerOptions(**options))  # type: ignore[arg-type]
+    runs: Any = SimpleNamespace(ids=[served.id], get=lambda name: served)
+    return WarmServer(runs, ServerOptions(**options))
 
 
 @contextmanager

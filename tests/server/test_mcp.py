@@ -46,9 +46,8 @@ async def walk(target: Any) -> list[str]:
             ({**which, "prompts": ["red"], "object_number": 99}, "no object 99"),
         ):
             wrong = await agent.call_tool("list_objects" if "object_number" not in arguments else "explain", arguments)
-            assert (
-                wrong.is_error and words in wrong.content[0].text and "/" not in wrong.content[0].text.split("run")[0]
-            )
+            text = wrong.content[0].text
+            assert wrong.is_error and words in text and "/" not in text.split("run")[0]
         resource = await agent.read_resource(f"normlift://runs/{run['id']}/catalog")
         assert len(json.loads(resource.contents[0].text)["objects"]) > 0
         if "export" not in tools:

@@ -11,24 +11,18 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from normlift_ns import GaussianScene
 from normlift_ns.server.permalink import PageView
 from normlift_ns.server.protocol import Codes
 from normlift_ns.server.runs import ServedRun, without_paths
 from normlift_ns.session.state import State
+from tests.random_scenes import random_scene
 from tests.server.pages import make_served
 from tests.session.worlds import BLOCK, world
 from tests.viewer.scenes import camera, scene_of, spheres
 
 
-def gaussians(count: int = 4 * BLOCK) -> GaussianScene:
-    g = torch.Generator().manual_seed(0)
-    scales, quats = (torch.rand(count, 3, generator=g) * 3 - 3).exp(), torch.randn(count, 4, generator=g)
-    return GaussianScene(torch.randn(count, 3, generator=g), quats, scales, torch.rand(count, generator=g))
-
-
 def test_the_faintest_and_smallest_of_too_many_are_left_out_and_downloads_count_what_is_in_the_file(tmp_path):
-    found = gaussians()
+    found = random_scene(4 * BLOCK, dtype=torch.float32)
     found.opacities[:3] = 1e-4
     served = make_served(tmp_path, scene_of(found, cameras=(camera(),)), world())
     few = ServedRun("few", served.run, 50)
@@ -43,7 +37,7 @@ def test_the_faintest_and_smallest_of_too_many_are_left_out_and_downloads_count_
 
 
 def test_the_geometry_holds_the_rows_in_their_order(tmp_path):
-    found = gaussians()
+    found = random_scene(4 * BLOCK, dtype=torch.float32)
     for logits in (False, True):
         scene = scene_of(found, cameras=(camera(),))
         scene.has_harmonics = not logits

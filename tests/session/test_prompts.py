@@ -35,15 +35,9 @@ def test_joined_prompts_are_split_again(texts):
 
 
 def test_an_unknown_word_marks_its_row_and_the_rest_is_answered():
-    calls = []
-
-    def counted(texts):
-        calls.append(tuple(texts))
-        return read(texts)
-
-    found = encode_prompts("red, zebra; blue", counted)
+    found = encode_prompts("red, zebra; blue", encoder := Mock(side_effect=read))
     assert [(one.text, "'zebra'" in one.error) for one in found] == [("red", False), ("zebra", True), ("blue", False)]
-    assert (found[0].error, calls[0]) == ("", ("red", "zebra", "blue"))
+    assert (found[0].error, [*encoder.call_args_list[0].args[0]]) == ("", ["red", "zebra", "blue"])
     prompts, question = build_query(world().field, found, read, negatives=())
     assert prompts == found
     assert question.texts == ("red", "blue")

@@ -57,10 +57,8 @@ def test_a_click_selects_the_connected_object_adds_and_takes_away():
     for blind, gaussian in ((state, 3 * BLOCK), (actions.hide(actions.click(state, ray(0))), 0)):
         with pytest.raises(InputError, match=r"(?i)click"):  # without a direction, or hidden
             actions.click(blind, ray(gaussian))
-    prompts, question = build_query(
-        world().field, [Prompt(click_name(1), actions.picked_direction(state, ray(BLOCK + 1)))], read
-    )
-    assert chosen(actions.ask(State(world()), prompts, question), 1)
+    like = Prompt(click_name(1), actions.picked_direction(state, ray(BLOCK + 1)))
+    assert chosen(actions.ask(State(world()), *build_query(world().field, [like], read)), 1)
 
 
 def test_the_thresholds_go_on_after_a_click_that_adds_and_stay_within_their_sliders():

@@ -22,10 +22,8 @@ from tests.session.worlds import BLOCK, ray, read, rows, world
 @cache
 def coloured() -> SelectionContext:
     """The world with an encoder whose cosines have a threshold; that of the plain one nobody knows."""
-    encoder = encoder_settings(SourceOptions(encoder="color"))
-    return SelectionContext(
-        replace(world().field, manifest={**world().field.manifest, "encoder": encoder}), world().means
-    )
+    manifest = {**world().field.manifest, "encoder": encoder_settings(SourceOptions(encoder="color"))}
+    return SelectionContext(replace(world().field, manifest=manifest), world().means)
 
 
 def asked(space: SelectionContext, line: str, state: State | None = None) -> State:
@@ -50,9 +48,8 @@ def test_a_text_that_is_not_there_is_said_with_its_nearest_match():
     assert "Use suggested" in verdict.warning and verdict.nearest_position is not None
 
 
-@pytest.mark.parametrize(
-    ("encoder", "prompt", "known"),
-    [
+def test_words_that_do_not_count_are_said() -> None:
+    for encoder, prompt, known in (
         ("color", "The red", None),
         ("color", "gray", None),
         ("color", "gray wall", "gray"),
@@ -61,15 +58,14 @@ def test_a_text_that_is_not_there_is_said_with_its_nearest_match():
         ("imagenet", "blue fox", "fox"),
         ("imagenet", "not two foxes in the snow", "foxes"),
         ("open_clip", "blue fox", None),
-    ],
-)
-def test_words_that_do_not_count_are_said(encoder: str, prompt: str, known: str | None) -> None:
-    manifest = {**world().field.manifest, "encoder": encoder_settings(SourceOptions(encoder=encoder))}
-    field = replace(world().field, manifest=manifest)
-    state = State(SelectionContext(field, world().means), query=Query((prompt,), np.eye(3, dtype=np.float32)[:1]))
-    assert state.answer is not None and state.answer[prompt].read_as == known == state.answer.to_json()[0]["read_as"]
-    (verdict,) = diagnose_prompts(state)
-    assert (f'read as "{known}"' in verdict.warning) == (known is not None)
+    ):
+        manifest = {**world().field.manifest, "encoder": encoder_settings(SourceOptions(encoder=encoder))}
+        space = SelectionContext(replace(world().field, manifest=manifest), world().means)
+        state = State(space, query=Query((prompt,), np.eye(3, dtype=np.float32)[:1]))
+        assert state.answer is not None
+        assert state.answer[prompt].read_as == known == state.answer.to_json()[0]["read_as"], prompt
+        (verdict,) = diagnose_prompts(state)
+        assert (f'read as "{known}"' in verdict.warning) == (known is not None), prompt
 
 
 def test_histograms_are_of_the_prompts_that_select():
