@@ -126,8 +126,7 @@ def test_a_region_that_overlaps_nothing_keeps_its_feature():
 @given(seed=SEEDS)
 def test_levels_together_are_levels_apart(device, seed):
     """Two levels of masks of the same pictures in one evidence, columns in any order within their view: the same as
-    each on its own, though regions of both hold the same Gaussians.
-    """
+    each on its own, though regions of both hold the same Gaussians."""
     weights = [dense(things(seed + i, count=n).rows, 5 * n).view(60, 5, n) for i, n in enumerate((3, 4))]
     seen = weights[0].sum(2, keepdim=True) * (weights[1].sum(2, keepdim=True) > 0)  # a pixel counts in either level
     weights = [torch.nan_to_num(weight / weight.sum(2, keepdim=True)) * seen for weight in weights]

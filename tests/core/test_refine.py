@@ -41,8 +41,7 @@ Scores = list[dict[int, Decimal]]
 
 def scores(means, u, r, config, own=None) -> Scores:
     """What every Gaussian and its K nearest neighbours, nearest first, score in both votes as `refine` defines them:
-    one term at a time, nothing shifted, in decimal numbers that do not underflow.
-    """
+    one term at a time, nothing shifted, in decimal numbers that do not underflow."""
     n, numbers, rely = len(means), config.numbers, [Decimal(x) for x in r.tolist()]
     distance, cosine = (means[:, None] - means[None]).norm(dim=-1), (u @ u.T).tolist()
     nearest = torch.where(distance > 0, distance, math.inf).min(1).values
@@ -162,9 +161,7 @@ def test_chunks_and_blocks_change_nothing_and_progress_comes_in_blocks(monkeypat
 
 
 def test_unreliable_neighbourhoods_stay_untouched_and_are_counted():
-    """Two clusters far apart; nobody in the second is reliable, so nothing there can be repaired (limitation 4 of the
-    paper).
-    """
+    """Nobody in the second of two distant clusters is reliable, so nothing there can be repaired (limitation 4)."""
     means, u, r = scene(3)
     means[30:] += 1000
     r[30:] = 0
@@ -180,8 +177,7 @@ def test_unreliable_neighbourhoods_stay_untouched_and_are_counted():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_one_far_from_everything_is_repaired_as_without_underflow(dtype):
     """A Gaussian without evidence, 1,000 spacings from a cluster: exp(-500,000) is 0 in any format of the machine. It
-    takes the mode at Delta = 0, and clears no margin in the paper's vote.
-    """
+    takes the mode at Delta = 0, and clears no margin in the paper's vote."""
     means, u, r = scene(3, n=25)
     means[0] = torch.tensor([1000.0, 0, 0])
     u[0], r[0] = 0, 0
@@ -208,15 +204,12 @@ def test_gaussians_outside_of_regions_keep_their_direction():
     assert torch.equal(labeled_share(evidence), expected) and bool((whole == 0).any())
 
 
-def test_coincident_gaussians_copy_the_most_reliable():
+def test_coincident_gaussians_copy_the_most_reliable_and_half_precision_votes_alike():
     means = torch.zeros(6, 3, dtype=torch.float64)
     u = unit_rows(1, 8, 0).repeat(6, 1)
     r = torch.tensor([0, 0, 0.2, 0.9, 0.9, 0.1], dtype=torch.float64)
     source = refine(means, torch.where(r[:, None] > 0, u, 0.0), r, RefineConfig(vote="paper", k=5))
     assert source.tolist() == [3, 3, 3, 3, 4, 3]
-
-
-def test_half_precision_directions_vote_like_float32():
     means, u, r = scene(6)
     single, half = refine(means, u.float(), r), refine(means, u.half(), r)
     assert (single == half).float().mean() > 0.95
@@ -235,6 +228,8 @@ def test_what_does_not_fit_is_named():
             refine(means, u, r, config, own=own)
     with pytest.raises(InputError, match=r"n = 60.*\(59,\)"):
         refine(means, u, r, config, own=r, labeled=r[1:])
+    with pytest.raises(ValueError, match=f"variant.*{', '.join(get_args(Variant))}.*mean"):
+        refine_variant("mean", means, lift(random_evidence(60, [2], 0), unit_rows(2, 8, 0)))
 
 
 def test_defaults_are_those_of_the_kind_of_vote():
@@ -253,11 +248,7 @@ def test_configs_and_manifests_of_version_01_keep_the_papers_vote():
         "options": {"vote": {"k": 36, "sigma_d": 2.5, "tau": 0.9, "gamma": 0.4, "delta": 0.1}, "reliability_beta": 2.0}
     }
     own = recorded_vote(manifest)
-    assert (own.variant, own.config.vote, own.config.numbers) == (
-        "paper",
-        "paper",
-        VoteParameters(2.5, 0.9, 0.4, 0.1, 0.0),
-    )
+    assert own.variant == own.config.vote == "paper" and own.config.numbers == VoteParameters(2.5, 0.9, 0.4, 0.1, 0.0)
     assert recorded_vote({}).config == RefineConfig()
     told = asdict(clamp_k(RefineConfig(vote="posterior", tau=0.5), 1000))  # gamma may still be measured
     numbers = {"k": 36, "prior": 4.0, "delta": 0.0, "gamma": None, "sigma_d": 2.0, "tau": 0.5, "min_labeled": 0.2}
@@ -278,12 +269,8 @@ def test_ablation_variants_are_what_their_names_say():
     ones = (scalars.norm > 0).double()
     support = torch.where(scalars.n_eff > 0, scalars.n_eff / (scalars.n_eff + 1), 0.0)
     assert torch.equal(got["none"], u)
-    for name, r in (
-        ("plain_knn", ones),
-        ("norm_only", scalars.norm),
-        ("support_only", support),
-        ("paper", scalars.reliability),
-    ):
+    rely = {"plain_knn": ones, "norm_only": scalars.norm, "support_only": support, "paper": scalars.reliability}
+    for name, r in rely.items():
         assert torch.equal(got[name], u[refine(means, u, r, config).long()]), name
     own = scalars.norm * scalars.n_eff
     assert torch.equal(scalars.own_evidence, own)
@@ -302,12 +289,3 @@ def test_ablation_variants_are_what_their_names_say():
     weight = torch.exp(-0.5 * (distance / width) ** 2) * lifted.scalars.reliability[group]
     assert torch.allclose(got["linear"][7], torch.nn.functional.normalize(weight @ u[group], dim=0))
     assert len({value.sum().item() for value in got.values()}) == 7
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_unknown_variant():
-    lifted = lift(random_evidence(5, [2], 0), unit_rows(2, 8, 0))
-    known = ", ".join(get_args(Variant))
-    assert len(get_args(Variant)) == 7
-    with pytest.raises(ValueError, match=f"variant.*{known}.*mean"):
-        refine_variant("mean", torch.rand(5, 3), lifted)

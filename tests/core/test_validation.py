@@ -6,13 +6,10 @@ from math import inf, nan
 import pytest
 import torch
 
-from normlift_ns import Evidence, RefineConfig, consensus, lift, refine
-from normlift_ns.core.evidence import Entries
-from tests.random_scenes import generator, unit_rows
+from normlift_ns import RefineConfig, consensus, lift, refine
+from tests.random_scenes import generator, random_evidence, unit_rows
 
-EVIDENCE = Evidence.from_entries(
-    [Entries(torch.tensor([0, 0, 1, 1]), torch.tensor([1, 3, 1, 3]), torch.ones(4), num_regions=(1, 1))], 2
-)
+EVIDENCE = random_evidence(2, [1, 1], 0, fill=1.0, dtype=torch.float32)
 GOOD = torch.tensor([[0.6, 0.8], [1.0, 0.0]])
 BAD_ROWS = (nan, inf, 5.0)
 N = 40

@@ -39,12 +39,6 @@ def focal(factor: float):
     return lambda view: view._replace(camera=replace(view.camera, K=view.camera.K * scale))
 
 
-def shifted(view: View) -> View:
-    pose = view.camera.world_to_camera.clone()
-    pose[2, 3] -= 1000
-    return view._replace(camera=replace(view.camera, world_to_camera=pose))
-
-
 def noisy(view: View) -> View:
     noise = 25 * torch.randn(view.image.shape, generator=generator(0))
     return view._replace(image=(view.image + noise).clamp(0, 255).to(torch.uint8))
@@ -63,6 +57,14 @@ def test_what_belongs_together_passes(scene, trained: Path) -> None:
     assert match.mean_color_psnr < 20
     assert alignment_warning(match, trained_cameras=True) is None
 
+    def hidden(view: View) -> View:
+        image, mask = view.image.clone(), torch.ones(view.image.shape[:2], dtype=torch.bool)
+        image[: len(image) // 2] = 0
+        mask[: len(image) // 2] = False
+        return view._replace(image=image, mask=mask)
+
+    assert measure_alignment(Changed(scene, hidden)).psnr > 40  # masked pixels do not count
+
 
 def warning_of(scene, change) -> str:
     warning = alignment_warning(measure_alignment(Changed(scene, change)), trained_cameras=True)
@@ -76,18 +78,12 @@ def moved(pixels: float):
 
 
 def distorted(k1: float):
-    """Images of a lens with this distortion."""
-
     def change(view: View) -> View:
-        (fx, _, cx), (_, fy, cy), _ = view.camera.K.tolist()
+        K = view.camera.K.double().numpy() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         height, width = view.image.shape[:2]
-        y, x = np.mgrid[:height, :width] + 0.5
-        x, y = x0, y0 = (x - cx) / fx, (y - cy) / fy
-        for _ in range(50):
-            stretch = 1 + k1 * (x * x + y * y)
-            x, y = x0 / stretch, y0 / stretch
-        u, v = (value.astype(np.float32) for value in (fx * x + cx - 0.5, fy * y + cy - 0.5))
-        return view._replace(image=torch.from_numpy(cv2.remap(view.image.numpy(), u, v, cv2.INTER_LINEAR)))
+        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 1, 2).astype(float)
+        seen = cv2.undistortPoints(pixels, K, np.array([k1, 0, 0, 0]), P=K).reshape(height, width, 2).astype(np.float32)
+        return view._replace(image=torch.from_numpy(cv2.remap(view.image.numpy(), seen, None, cv2.INTER_LINEAR)))
 
     return change
 
@@ -97,7 +93,6 @@ def distorted(k1: float):
     [
         (focal(1.02), "Focal lengths that are (.*)% shorter", 1.96),
         (focal(0.98), "Focal lengths that are (.*)% longer", 2.04),
-        (focal(1.25), "Focal lengths that are (.*)% shorter", 20),
         (moved(8), "principal point that is shifted by (.*) pixels left", 8),
         (distorted(0.1), "k1 that is higher by (.*) fits", 0.1),
         (noisy, "([0-9]*) dB or more is usual", 24),
@@ -153,6 +148,10 @@ def test_low_contrast_has_the_margin_of_full_contrast_down_to_the_noise(scene) -
 
 
 def test_cameras_and_images_of_another_scene_are_refused(scene) -> None:
+    def shifted(view: View) -> View:
+        away = torch.tensor([0, 0, -1000, 0])[:, None] * torch.tensor([0, 0, 0, 1])
+        return view._replace(camera=replace(view.camera, world_to_camera=view.camera.world_to_camera + away))
+
     with pytest.raises(InputError, match=r"0\.00%"):
         alignment_warning(measure_alignment(Changed(scene, shifted)), trained_cameras=True)
     upside_down = Changed(scene, lambda view: view._replace(image=255 - view.image.flip(0)))
@@ -177,16 +176,6 @@ def test_one_wrong_photograph_of_three_is_named(scene) -> None:
         assert match.psnr > 24 > match.worst[1] and match.worst[0] == name
         warning = alignment_warning(match, trained_cameras=True)
         assert warning is not None and f"{name}, one of the training images" in warning
-
-
-def test_masked_pixels_do_not_count(scene) -> None:
-    def hidden(view: View) -> View:
-        image, mask = view.image.clone(), torch.ones(view.image.shape[:2], dtype=torch.bool)
-        image[: len(image) // 2] = 0
-        mask[: len(image) // 2] = False
-        return view._replace(image=image, mask=mask)
-
-    assert measure_alignment(Changed(scene, hidden)).psnr > 40
 
 
 @needs_shared

@@ -117,6 +117,7 @@ def test_models_that_are_simpler_than_their_name(tmp_path: Path) -> None:
         assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (500, 501, 320, 240, kept)
     for line, message in (
         ("FULL_OPENCV 640 480 500 501 320 240 0 0 0 0 0 0 0.1 0", r"FULL_OPENCV, k4 = 0, k5 = 0\.1"),
+        ("FOV 640 480 500 501 320 240 0.5", r"FOV, omega = 0\.5"),
         ("THIN_PRISM_FISHEYE 640 480 500 501 320 240 0 0 0 0 0 0 0.1 0", r"THIN_PRISM_FISHEYE, .*sx1 = 0\.1"),
         ("SIMPLE_DIVISION 640 480 500 320 240 -0.1", r"SIMPLE_DIVISION, k = -0\.1"),
         ("EUCM 640 480 500 501 320 240 0.5 1", "EUCM"),

@@ -58,6 +58,7 @@ def test_other_content_is_refused(tmp_path: Path) -> None:
     for name, value, message in (
         ("means", torch.full((200, 3), torch.nan), "means .* NaN"),
         ("means", torch.zeros(200, 2), r"means is torch.float32 \(200, 2\)"),
+        ("means", torch.zeros(200, 3, dtype=torch.int64), "means is torch.int64"),
         ("quats", torch.zeros(100, 4), r"quats is torch.float32 \(100, 4\)"),
         ("sh0", torch.zeros(200, 3), r"sh0 has shape \(200, 3\)"),
         ("shN", torch.zeros(200, 7, 3), r"harmonics have shape \(200, 7, 3\)"),

@@ -43,7 +43,7 @@ from tests.hostile import damaged, fuzz, hostile_json, no_files
 N = 20
 CAMERA = Intrinsics(40.0, 40.0, 20.0, 15.0, 40, 30)
 BLACK = torch.zeros(3)
-PLAIN = Image.new("RGB", (40, 30))
+PLAIN, NOISE = Image.new("RGB", (40, 30)), Image.effect_noise((40, 30), 50)
 CHECKPOINT = "step-000000007.ckpt"
 
 
@@ -71,11 +71,13 @@ def test_half_precision_and_float64_become_float32(tmp_path: Path) -> None:
 OTHER: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "shorter": lambda value: value[:-1],
     "flat": lambda value: value.reshape(-1),
+    "wider": lambda value: torch.cat([value, value], dim=-1),
     "int64": lambda value: value.long(),
     "sparse": lambda value: value.to_sparse(),
     "expanded": lambda value: value[:1].expand(10**6, *value.shape[1:]),
     "meta": lambda value: torch.empty(value.shape, device="meta"),
     "quantized": lambda value: torch.quantize_per_tensor(value, 0.1, 0, torch.qint8),
+    "float8": lambda value: value.to(torch.float8_e4m3fn),
     "a number": lambda value: torch.zeros(()),
 }
 
@@ -247,10 +249,6 @@ def looked_at(path: Path) -> None:
     _ = ImageViews([frame], BLACK)[0]
 
 
-def noise() -> Image.Image:
-    return Image.effect_noise((40, 30), 50)
-
-
 def saved_splat(path: Path) -> None:
     views, none = ImageViews([image_frame(path.parent, PLAIN)], BLACK), ImageViews([], BLACK)
     there = path.parent
@@ -266,8 +264,8 @@ LOADERS: dict[str, tuple[str, Callable[[Path], object], Callable[[Path], Any]]] 
     "gsplat": ("ckpt_7_rank0.pt", lambda path: write_gsplat(path, random_splat(N), step=7), read_gsplat_checkpoint),
     "ply": ("x.ply", lambda path: write_ply(path, ply_columns(random_splat(N, 1))), read_ply),
     "text ply": ("x.ply", lambda path: write_ply(path, ply_columns(random_splat(N, 1)), text=True), read_ply),
-    "JPEG": ("a.png", lambda path: noise().convert("RGB").save(path, "JPEG"), looked_at),
-    "mask": ("mask.png", lambda path: (image_frame(path.parent, PLAIN), noise().save(path)), looked_at),
+    "JPEG": ("a.png", lambda path: NOISE.convert("RGB").save(path, "JPEG"), looked_at),
+    "mask": ("mask.png", lambda path: (image_frame(path.parent, PLAIN), NOISE.save(path)), looked_at),
     "world": ("world.json", lambda path: path.write_text(json.dumps(np.eye(4).tolist())), read_world_transform),
     "world.npy": ("world.npy", lambda path: np.save(path, np.eye(4)), read_world_transform),
     "world.txt": ("world.txt", lambda path: np.savetxt(path, np.eye(4)), read_world_transform),

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES
 from normlift_ns.encoders.huggingface_network import HuggingFaceEncoder
@@ -124,18 +125,14 @@ def test_the_identity_changes_with_any_weight(name: str, clip_weights: Path, hub
     options = options_of(name, folder)
     before = make_encoder(options).identity
     file = folder / ("tiny.safetensors" if name == "open_clip" else "model.safetensors")
-    whole = file.read_bytes()
-    size = int.from_bytes(whole[:8], "little")
-    header = json.loads(whole[8 : 8 + size])
-    places = [header[key]["data_offsets"] for key in sorted(header) if key != "__metadata__"]
-    assert len(places) > 20
-    for start, end in [places[0], *places[5 :: 12 // min(FACTOR, 12)], places[-1]]:
-        content = bytearray(whole)
-        content[8 + size + (start + end) // 2] ^= 1
-        file.write_bytes(content)
+    whole, state = file.read_bytes(), load_file(file)
+    names = sorted(state)
+    for key in {names[0], *names[5 :: 12 // min(FACTOR, 12)], names[-1]}:
+        save_file({**state, key: state[key] + 1}, file)
         assert make_encoder(options).identity != before
     file.write_bytes(whole)
     assert make_encoder(options).identity == before
+    assert make_encoder(replace(options, crop_fill="white")).identity != before
     if name == "open_clip":
         return
     for other in (one for one in folder.iterdir() if one != file):
@@ -145,7 +142,6 @@ def test_the_identity_changes_with_any_weight(name: str, clip_weights: Path, hub
         other.write_bytes(content)
     moved = folder.rename(tmp_path / "moved")
     assert make_encoder(options_of(name, moved)).identity == before
-    assert make_encoder(replace(options_of(name, moved), crop_fill="white")).identity != before
 
 
 def use(folder: Path, name: str = "siglip2") -> None:
@@ -201,7 +197,6 @@ def test_what_is_wrong_with_a_folder_is_said(hub_weights: Path, tmp_path: Path) 
     table: list[tuple[Callable[[Path], object], list[str]]] = [
         (cut("model.safetensors"), ["SigLIP 2", "--encoder-model", "--encoder open_clip"]),
         (cut("config.json"), ["config.json"]),
-        (cut("tokenizer.json"), ["SigLIP 2"]),
         (gone("tokenizer.json"), ["tokenizer.json"]),
         (gone("processor_config.json"), ["preprocessor_config.json"]),
         (gone("config.json"), ["config.json"]),

@@ -244,6 +244,7 @@ def test_broken_files_are_named_before_the_lift(folder, tmp_path):
         ("s", npy("|O", (4,), b"\x80\x04N."), ["NPY", "objects"]),
         ("s", b"", ["NPY"]),
         ("s", npy("<f4", (3, 1, 1), b"\0" * 12), ["float32 (3, 1, 1)", "[4, H, W]"]),
+        ("s", npy("<f4", (4, 0, 1), b""), ["float32 (4, 0, 1)"]),
         ("f", npy("<f4", (7, 3), b"\0" * 84), ["float32 (7, 3)", "language_features_dim3"]),
         ("f", npy("<i4", (7, D), b"\0" * 28 * D), ["int32 (7, 512)"]),
     ):

@@ -27,7 +27,6 @@ from normlift_ns.options import SourceOptions
 from normlift_ns.query.text_encoder import encoder_settings, text_encoder_for
 from tests.encoders.test_weights import put
 from tests.encoders.tiny import CLIP, CLIP_CONFIG, DEVICES, noise, refused
-from tests.encoders.tiny import CLIP as NAME
 
 IMAGE = noise(48, 64)
 LABELS = torch.full((48, 64), -1, dtype=torch.int32)
@@ -39,7 +38,7 @@ MAPS = LABELS[None]
 
 def publish(monkeypatch, hub, weights, **settings) -> str:
     published = import_open_clip().pretrained._PRETRAINED
-    monkeypatch.setitem(published, NAME, {"tag": {"hf_hub": "someone/tiny/", **settings}})
+    monkeypatch.setitem(published, CLIP, {"tag": {"hf_hub": "someone/tiny/", **settings}})
     put(hub, "someone/tiny", "open_clip_model.safetensors", (weights / "tiny.safetensors").read_bytes())
     return "tag"
 
@@ -95,7 +94,7 @@ def test_timm_is_imported_without_wandb(monkeypatch):
 
 @torch.no_grad()
 def test_features_and_texts_are_those_of_the_model(clip, open_clip):
-    model = open_clip.create_model(NAME, pretrained=clip.pretrained).eval()
+    model = open_clip.create_model(CLIP, pretrained=clip.pretrained).eval()
     mean, std = (np.array(value, np.float32) for value in (model.visual.image_mean, model.visual.image_std))
     crops = [(cv2.resize(square_by_hand(region, 0), (32, 32)) / 255 - mean) / std for region in range(3)]
     expected = model.encode_image(torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2).float(), normalize=True)
@@ -105,7 +104,7 @@ def test_features_and_texts_are_those_of_the_model(clip, open_clip):
     assert (features * expected).sum(dim=1).min() > 0.999  # but for the rounding of cv2
     assert (features @ features.T).fill_diagonal_(0).max() < 0.999  # the crops do differ
     prompts = ["a red mug", "a wine bottle"]
-    expected = model.encode_text(open_clip.get_tokenizer(NAME)(prompts), normalize=True)
+    expected = model.encode_text(open_clip.get_tokenizer(CLIP)(prompts), normalize=True)
     torch.testing.assert_close(clip.text(prompts), expected, rtol=0, atol=1e-6)
 
 
@@ -149,10 +148,10 @@ def test_bad_weight_files_are_named_with_a_remedy(clip_weights, tmp_path):
         save(wrong, path)
         for content in (path.read_bytes(), whole[: len(whole) // 2], b"", pickle.dumps([1, 2])):
             path.write_bytes(content)
-            parts = (str(path), NAME, "--encoder-model", "--encoder color")
-            refused(lambda path=path: OpenClipEncoder(NAME, str(path)).text(["red"]), *parts)
+            parts = (str(path), CLIP, "--encoder-model", "--encoder color")
+            refused(lambda path=path: OpenClipEncoder(CLIP, str(path)).text(["red"]), *parts)
     torch.save({"state_dict": Bomb(str(tmp_path / "ran"))}, tmp_path / "bad.pt")  # pickles run no code
-    refused(lambda: OpenClipEncoder(NAME, str(tmp_path / "bad.pt")).text(["red"]), "bad.pt")
+    refused(lambda: OpenClipEncoder(CLIP, str(tmp_path / "bad.pt")).text(["red"]), "bad.pt")
     assert not (tmp_path / "ran").exists()
 
 
@@ -166,8 +165,8 @@ def test_absent_weights_give_one_message(empty_hub):
 
 def test_cached_downloads_need_no_network(empty_hub, clip_weights, open_clip, monkeypatch):
     tag = publish(monkeypatch, empty_hub, clip_weights, mean=(0.5, 0.5, 0.5), std=(0.25, 0.25, 0.25))
-    encoder = OpenClipEncoder(NAME, tag)
-    local = OpenClipEncoder(NAME, str(clip_weights / "tiny.pt"))
+    encoder = OpenClipEncoder(CLIP, tag)
+    local = OpenClipEncoder(CLIP, str(clip_weights / "tiny.pt"))
     assert torch.equal(encoder.text(["red"]), local.text(["red"]))
     # Both take the published mean and standard deviation, not those of OpenAI.
     for network in (encoder.network, local.network):
@@ -175,10 +174,10 @@ def test_cached_downloads_need_no_network(empty_hub, clip_weights, open_clip, mo
     assert torch.equal(encoder.encode(IMAGE, MAPS), local.encode(IMAGE, MAPS))
     # The activation is that of the training
     tag = publish(monkeypatch, empty_hub, clip_weights, quick_gelu=True)
-    model = open_clip.create_model(NAME, pretrained=str(clip_weights / "tiny.pt"), force_quick_gelu=True).eval()
+    model = open_clip.create_model(CLIP, pretrained=str(clip_weights / "tiny.pt"), force_quick_gelu=True).eval()
     with torch.no_grad():
-        expected = model.encode_text(open_clip.get_tokenizer(NAME)(["red"]), normalize=True)
-    torch.testing.assert_close(OpenClipEncoder(NAME, tag).text(["red"]), expected, rtol=0, atol=1e-6)
+        expected = model.encode_text(open_clip.get_tokenizer(CLIP)(["red"]), normalize=True)
+    torch.testing.assert_close(OpenClipEncoder(CLIP, tag).text(["red"]), expected, rtol=0, atol=1e-6)
     assert not torch.allclose(local.text(["red"]), expected, atol=1e-5)
 
 

@@ -65,9 +65,9 @@ class Index:
         self.address = f"127.0.0.1:{self.server.server_port}"
 
     def offer(self, wheel: bytes, page: str = "html") -> None:
-        links = {"html": f'<a href="../../files/{TINY.wheel}">{TINY.wheel}</a>'}
         entry = {"filename": TINY.wheel, "url": f"http://{self.address}/files/{TINY.wheel}"}
-        links["json"] = json.dumps({"files": [entry]})
+        html = f'<a href="../../files/{TINY.wheel}">{TINY.wheel}</a>'
+        links = {"html": html, "json": json.dumps({"files": [entry]})}
         self.pages = {"/simple/tiny-weights/": links[page].encode(), f"/files/{TINY.wheel}": wheel}
 
 

@@ -40,24 +40,22 @@ def test_many_levels_of_many_regions_do_not_overflow():
     assert torch.equal(regions[:, cells.long()], maps)
 
 
-MAPS = np.stack([np.repeat([[1, 1, 2, 2]], 4, 0), np.repeat([[1], [1], [0], [2]], 4, 1), np.zeros((4, 4), int)])
-IMAGE = noise(4, 4)
-
-
 def test_every_level_has_the_same_cells_and_its_own_features(tmp_path):
-    np.save(tmp_path / "a.npy", MAPS)
-    views = [RegionFeatures(LabelFiles(tmp_path, level=i), ColorEncoder()).view(IMAGE, "a.jpg") for i in range(3)]
+    steps = np.repeat([[1], [1], [0], [2]], 4, 1)
+    np.save(tmp_path / "a.npy", np.stack([np.repeat([[1, 1, 2, 2]], 4, 0), steps, np.zeros((4, 4), int)]))
+    image = noise(4, 4)
+    views = [RegionFeatures(LabelFiles(tmp_path, level=i), ColorEncoder()).view(image, "a.jpg") for i in range(3)]
     assert all(torch.equal(view.labels, views[0].labels) for view in views)
     for level, view in enumerate(views):
-        alone = LabelFiles(tmp_path).labels(IMAGE, "a.jpg")[level]
+        alone = LabelFiles(tmp_path).labels(image, "a.jpg")[level]
         assert torch.equal(view.region_of_cell[0, view.labels.long()], alone[0])
-        assert torch.equal(view.features, ColorEncoder().encode(IMAGE, alone))
+        assert torch.equal(view.features, ColorEncoder().encode(image, alone))
     assert views[2].features.shape[0] == 0
     for wrong in (None, 3):
         source = RegionFeatures(LabelFiles(tmp_path, level=wrong), ColorEncoder())
-        refused(lambda source=source: source.view(IMAGE, "a.jpg"), "a.npy", "levels 0..2", "--level")
+        refused(lambda source=source: source.view(image, "a.jpg"), "a.npy", "levels 0..2", "--level")
     two = type("Two", (LabelFiles,), {"chosen": (1, 0)})
-    (zero, one, _), view = views, RegionFeatures(two(tmp_path), ColorEncoder()).view(IMAGE, "a.jpg")
+    (zero, one, _), view = views, RegionFeatures(two(tmp_path), ColorEncoder()).view(image, "a.jpg")
     assert torch.equal(view.features, torch.cat([one.features, zero.features]))
     offset = torch.where(zero.regions >= 0, zero.regions + len(one.features), -1)
     assert torch.equal(view.regions, torch.cat([one.regions, offset]))

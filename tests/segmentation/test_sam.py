@@ -134,8 +134,7 @@ def test_label_maps_hold_all_levels_with_overlaps_beneath(sam_weights, monkeypat
     sam = SamMasks(str(sam_weights / "tiny"), rules=MaskRules(points_per_side=4, predicted_iou=0.6, stability=0.6))
     image = noise(65, 85)
     labels, masks = sam.labels(image, "a.jpg"), sam.masks(image)
-    assert labels.dtype == torch.int32 and labels.shape[0] == 4 and labels.shape[2:] == (65, 85)
-    assert labels.shape[1] > 1
+    assert labels.shape[0] == 4 and labels.shape[1] > 1
     for level, maps in zip(masks.values(), labels):
         for i, mask in enumerate(level):
             assert torch.equal((maps == i).any(dim=0), mask)
@@ -148,10 +147,11 @@ def test_label_maps_hold_all_levels_with_overlaps_beneath(sam_weights, monkeypat
     assert labels.shape == (4, 1, 30, 40) and bool((labels == -1).all())
 
 
-def test_a_checkpoint_counts_by_its_content(sam_weights, tmp_path):
-    sam, copy = SamMasks(str(sam_weights / "sam_tiny.pth")), tmp_path / "other.pth"
+def test_identity_holds_the_content_and_the_rules_but_no_level(sam_weights, tmp_path):
+    sam = SamMasks(str(sam_weights / "sam_tiny.pth"))
     assert sam.identity == replace(sam, level="s").identity  # all levels are found
     assert replace(sam, rules=LOOSE).identity != sam.identity
+    copy = tmp_path / "other.pth"
     copy.write_bytes((sam_weights / "sam_tiny.pth").read_bytes())
     assert SamMasks(str(copy)).identity == sam.identity
     copy.write_bytes(copy.read_bytes() + b"x")
@@ -180,7 +180,6 @@ def test_other_kinds_of_sam_are_named(sam_weights, tmp_path):
         ({"image_encoder.pos_embed": torch.zeros(1, 8, 8, 32)}, ["image_encoder.patch_embed.proj.weight"]),
         ("edgetam", ["config.json", "'edgetam'", "'sam', 'sam2', 'sam2_video', 'sam_hq'"]),
         ("sam3", ["config.json", "'sam3'", "--regions sam3"]),
-        ("bert", ["'bert'", "'sam'"]),
         ("", ["config.json"]),
     )):  # fmt: skip
         if isinstance(kind, dict):
