@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from hashlib import blake2b
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -169,9 +170,10 @@ class EvidenceCollection:
             block = observe_views(self.scene, chunk, source, render_settings=rendered, downscale=divisor, on_view=done)
         kernels.start_lift(block.features[0].shape[1])
         with stages("evidence", len(self.views)) as step:
-            kernels.wait_for_evidence()
-            reuse, folder = self.options.reuse_evidence, self.cache / "evidence"
-            evidence = batch_evidence(self.gaussians, block, folder, self.config, reuse=reuse, on_view=step)
+            evidence = batch_evidence(
+                self.gaussians, block, self.cache / "evidence", self.config,
+                reuse=self.options.reuse_evidence, on_view=step, wait_for_kernels=kernels.wait_for_evidence,
+            )  # fmt: skip
         return ViewObservations.of_block(block, evidence)
 
 
@@ -202,16 +204,16 @@ class ViewBatch(NamedTuple):
 def chunk_views(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]:
     """Split views into chunks of at most 16; an interrupted lift loses the results of at most one chunk.
 
-    Every process gets the same number of chunks, if there are enough views. The evidence of a view does not depend on
-    the other views in its chunk.
+    Every process gets the same number of chunks, if there are enough views, and the sizes of chunks differ by at most
+    one view. The evidence of a view does not depend on the other views in its chunk.
 
     >>> [[len(chunk) for chunk in chunk_views(range(45), processes)] for processes in (1, 2)]
-    [[15, 15, 15], [12, 12, 12, 9]]
+    [[15, 15, 15], [12, 11, 11, 11]]
     """
-    chunks = -(-len(views) // _MAX_CHUNK)
-    chunks = processes * max(1, -(-chunks // processes))
-    size = max(1, -(-len(views) // chunks))
-    return [views[first : first + size] for first in range(0, len(views), size)]
+    count = -(-len(views) // _MAX_CHUNK)
+    count = processes * max(1, -(-count // processes))
+    starts = [-(-len(views) * number // count) for number in range(count + 1)]
+    return [views[first:last] for first, last in pairwise(starts) if first < last]
 
 
 def sample_evenly(count: int, maximum: int | None) -> list[int]:
@@ -315,12 +317,17 @@ def batch_evidence(
     *,
     reuse: bool,
     on_view: Callable[[], None],
+    wait_for_kernels: Callable[[], None] = lambda: None,
 ) -> Evidence:
     """Return the evidence of the regions in a block, from the evidence of cells.
 
     The folder caches the cell evidence of each view. The function reads a view from the cache if `reuse` is True and
     its Gaussians, camera, labels and rasterization settings are the same. Its regions, its features and the other views
     of its block may differ.
+
+    Args:
+        on_view: Called after every view.
+        wait_for_kernels: Called before views that are not cached are rasterized.
     """
     keys = evidence_keys(gaussians, block, config)
     cached = find_cached_views(folder, keys) if reuse else {}
@@ -328,6 +335,7 @@ def batch_evidence(
     for _ in cached:
         on_view()
     if len(missing) > 0:
+        wait_for_kernels()
         evidence = rasterize_evidence(
             gaussians,
             [block.cameras[view] for view in missing],

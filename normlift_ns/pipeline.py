@@ -49,10 +49,16 @@ from normlift_ns.core.refine import (
 )
 from normlift_ns.core.reliability import independent_views, norm_of_reliability, pair_reliability
 from normlift_ns.core.scene import Scene, camera_summary
-from normlift_ns.data.alignment import alignment_warning, measure_alignment
+from normlift_ns.data.alignment import Alignment, alignment_warning, cached_alignment, measure_alignment
 from normlift_ns.data.nerfstudio.load import NerfstudioScene
 from normlift_ns.data.open_scene import SplatScene, open_scene, resolve_field_paths
-from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, precomputed_features
+from normlift_ns.encoders.base import (
+    FeatureSource,
+    PatchFeatures,
+    PrecomputedFeatures,
+    RegionFeatures,
+    precomputed_features,
+)
 from normlift_ns.encoders.build import make_source, null_vectors, source_settings
 from normlift_ns.encoders.langsplat import FeatureExport, check_unique_stems
 from normlift_ns.errors import InputError
@@ -232,9 +238,10 @@ def run_lift(request: LiftRequest) -> LiftedRun:
     refuse_small_memory(len(scene.gaussians), max((c.width * c.height for c in cameras), default=0))
     check_target(prepared)
     announce(prepared)
+    load_networks(prepared.source, cache)
     collection = plan_collection(scene, prepared.source, prepared.lift, cache, device=device, export=request.export)
     kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
-    check_alignment(prepared, stages, kernels.wait_for_rendering)  # while the other kernels are compiled
+    check_alignment(prepared, stages, kernels)  # while the other kernels are compiled
     result = lift_collection(collection, kernels, device=device, encoder=prepared.encoder, report=request.report)
     return write_lifted_run(prepared, result, stages)
 
@@ -247,6 +254,8 @@ def prepare_lift(request: LiftRequest) -> PreparedLift:
     if request.features is None:
         options = resolve_source(options, device)
         source = make_source(options, device)  # raises before the scene loads
+        if isinstance(source, RegionFeatures | PatchFeatures):
+            _start_in_background(partial(getattr, source, "identity"))  # reads the files of networks
     if source is not None and len(request.queries) > 0:
         source.text(request.queries)
     scene = request.open_scene()
@@ -270,6 +279,28 @@ def prepare_lift(request: LiftRequest) -> PreparedLift:
     return PreparedLift(request, scene, source, options, lift, device, run_dir, texts, encoder)
 
 
+def load_networks(source: FeatureSource, cache: Path) -> None:
+    """Start to load the networks of a first lift, whose cache folder is empty, in a background thread.
+
+    Errors are ignored here. They occur again at the first use of the networks.
+    """
+    regions = source.regions if isinstance(source, RegionFeatures) else None
+    encoder = source.encoder if isinstance(source, RegionFeatures | PatchFeatures) else None
+    if encoder is not None and not (cache / "features").exists():
+        _start_in_background(*(partial(getattr, part, "network", None) for part in (regions, encoder)))
+
+
+def _start_in_background(*calls: Callable[[], object]) -> None:
+    """Start a thread that runs some calls one after the other, and ignores their errors."""
+
+    def run() -> None:
+        for call in calls:
+            with suppress(Exception):
+                call()
+
+    Thread(target=run, name="background", daemon=True).start()
+
+
 def check_target(prepared: PreparedLift) -> None:
     """Complete file writes that earlier lifts left unfinished; raise if the run exists and must not be replaced."""
     complete_interrupted_lifts(prepared.run_dir)
@@ -290,26 +321,37 @@ def announce(prepared: PreparedLift) -> None:
         say(f"Warning: {remark}")
 
 
-def compare_with_images(scene: Scene, options: LiftOptions, device: str) -> str | None:
-    """Compare renders with training images; return a warning if they differ, or raise if they show different scenes."""
+def compare_with_images(
+    scene: Scene, options: LiftOptions, device: str, measure: Callable[..., Alignment] = measure_alignment
+) -> str | None:
+    """Compare renders with training images; return a warning if they differ, or raise if they show different scenes.
+
+    Args:
+        measure: Function that measures the agreement.
+    """
     settings = RasterSettings.recorded({**scene.identity, "gsplat_rules": resolve_gsplat_version(scene, options)})
     measured_with = RasterSettings.recorded(scene.identity)
     match = scene.alignment if isinstance(scene, SplatScene) and settings == measured_with else None
-    match = match or measure_alignment(scene, settings, device=device)
+    match = match or measure(scene, settings, device=device)
     return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
 
 
-def check_alignment(prepared: PreparedLift, stages: StageTimer, wait_for_rendering: Callable[[], None]) -> None:
+def check_alignment(prepared: PreparedLift, stages: StageTimer, kernels: KernelWarmUp) -> None:
     """Report the warning of `compare_with_images`, unless the request disables the comparison.
 
-    Args:
-        wait_for_rendering: Function that waits until the kernels for renders are compiled.
+    Start to compile the kernels of rasterization, unless the result is cached.
     """
     if not prepared.request.check_alignment:
+        kernels.start_rasterization()
         return
     with stages("check") as step:
-        wait_for_rendering()
-        warning = compare_with_images(prepared.scene, prepared.lift, prepared.device)
+        measure = measure_alignment
+        if prepared.lift.reuse_evidence:
+            folder = cache_folder(prepared.run_dir) / "alignment"
+            measure = partial(cached_alignment, folder=folder, wait_for_kernels=kernels.wait_for_rendering)
+        else:
+            kernels.wait_for_rendering()
+        warning = compare_with_images(prepared.scene, prepared.lift, prepared.device, measure)
         step()
     if warning is not None:
         prepared.request.say(f"Warning: {warning}")
@@ -393,6 +435,7 @@ def lift_scene(
     """
     collection = plan_collection(scene, source, options, cache, device=device, export=export)
     kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
+    kernels.start_rasterization()
     return lift_collection(collection, kernels, device=device, encoder=encoder, report=report)
 
 
@@ -784,6 +827,7 @@ class KernelWarmUp:
 
     Args:
         rendering: Calls that compile the kernels of renders.
+        sums: Calls that compile the other kernels of evidence.
         early: Calls that compile the other kernels that do not depend on the features.
         lift: Calls that compile the remaining kernels, as a function of the dimension of the features.
         load: Function that each thread calls first.
@@ -791,13 +835,15 @@ class KernelWarmUp:
 
     def __init__(
         self,
-        rendering: Iterable[Callable[[], None]] = (),
+        rendering: Sequence[Callable[[], None]] = (),
+        sums: Sequence[Callable[[], None]] = (),
         early: Iterable[Callable[[], None]] = (),
         lift: Callable[[int], Iterable[Callable[[], None]]] = lambda dimension: (),
         load: Callable[[], None] = lambda: None,
     ) -> None:
-        self._lift_calls, self._load, self._lift = lift, load, list[Thread]()
-        self._rendering, self._early = ([self._start(call) for call in calls] for calls in (rendering, early))
+        self._rendering_calls, self._sums_calls, self._lift_calls, self._load = rendering, sums, lift, load
+        self._rendering, self._sums, self._lift = list[Thread](), list[Thread](), list[Thread]()
+        self._early = [self._start(call) for call in early]
 
     def _start(self, call: Callable[[], None]) -> Thread:
         def run() -> None:
@@ -814,26 +860,38 @@ class KernelWarmUp:
         if len(self._lift) == 0:
             self._lift = [self._start(call) for call in self._lift_calls(dimension)]
 
+    def start_rasterization(self) -> None:
+        """Start to compile the kernels of renders and evidence, unless this has been done.
+
+        A lift with cached evidence does not need them.
+        """
+        if len(self._rendering) == 0:
+            self._rendering, self._sums = (
+                [self._start(call) for call in calls] for calls in (self._rendering_calls, self._sums_calls)
+            )
+
     def wait_for_rendering(self) -> None:
-        """Wait for the kernels of renders."""
+        """Start `start_rasterization`, and wait for the kernels of renders."""
+        self.start_rasterization()
         for thread in self._rendering:
             thread.join()
 
     def wait_for_evidence(self) -> None:
-        """Wait for all kernels that do not depend on the features."""
-        for thread in (*self._rendering, *self._early):
+        """Start `start_rasterization`, and wait for all kernels that do not depend on the features."""
+        self.start_rasterization()
+        for thread in (*self._rendering, *self._sums, *self._early):
             thread.join()
 
     def wait(self) -> None:
         """Wait for all kernels whose compilation has been started."""
-        for thread in (*self._rendering, *self._early, *self._lift):
+        for thread in (*self._rendering, *self._sums, *self._early, *self._lift):
             thread.join()
 
 
 def start_kernel_warm_up(
     scene: Scene, gaussians: GaussianScene, options: LiftOptions, config: RasterConfig
 ) -> KernelWarmUp:
-    """Start to compile or load the kernels of a lift in the background."""
+    """Start to compile or load the kernels of a lift in the background, except those of `start_rasterization`."""
     if config.backend == "numba":
         from normlift_ns.rasterization.numba import compile_kernels  # noqa: PLC0415 (importing numba takes a second)
 
@@ -844,7 +902,7 @@ def start_kernel_warm_up(
 
     rendering, sums = kernel_calls(gaussians, scene.train.cameras[0], **config.options)
     early, lift = lift_calls(gaussians.means, options)
-    return KernelWarmUp(rendering, [*sums, *early], lift, load_triton)
+    return KernelWarmUp(rendering, sums, early, lift, load_triton)
 
 
 def lift_calls(

@@ -537,6 +537,7 @@ def time_kernel_loading(scene: Scene, options: LiftOptions, *, device: str = "cp
     gaussians = scene.gaussians.to(device)
     config = pipeline.choose_raster_config(scene, gaussians, options)
     kernels = pipeline.start_kernel_warm_up(scene, gaussians, options, config)
+    kernels.start_rasterization()
     kernels.start_lift(_DIMENSION)
     return min(_MAX_LOAD_S, _seconds(kernels.wait, clock=perf_counter, device=device)[0])
 
@@ -565,7 +566,9 @@ def measure_capture(
     gaussians, used, drawing = collection.gaussians, collection.views, collection.config
     cuda = torch.device(device).type == "cuda"
     timed = partial(_seconds, clock=clock, device=device)
-    pipeline.start_kernel_warm_up(scene, gaussians, options, drawing).wait()
+    kernels = pipeline.start_kernel_warm_up(scene, gaussians, options, drawing)
+    kernels.start_rasterization()
+    kernels.wait()
     rendered = drawing.settings if options.image_source == "render" else None
 
     def observe(indices: Sequence[int], source: FeatureSource) -> _Observed:

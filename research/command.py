@@ -4,6 +4,7 @@
     python -m research.command --quick     fewer runs
     python -m research.command --config outputs/.../config.yml      another trained run in place of the fox
     python -m research.command --before ../before   times with colors, in turns with another checkout
+    python -m research.command --before ../before --lifts colors patches edges    only lifts, in turns
 
 CLIP is ViT-B-16 with random weights, which take as long as trained ones. Lifts use patches: a first lift with empty
 caches of kernels and bytecode, first lifts with these caches filled (median of 3; pip installs bytecode), and lifts
@@ -15,6 +16,9 @@ no cached features, with every stage cached, and, if numba is installed, on two 
 --render-dir with one prompt and three views, and with five prompts and all views. A thousand color names with given
 vectors are queried in a warm process on the GPU and on two cores. If its weights are on this machine, it measures edges
 with ImageNet's classifier. --quick measures the other checkout once, and omits its slowest cases.
+
+With --lifts, it measures three lifts of each kind: colors and patches with every stage cached, edges with an empty
+cache. The error is the fraction of files of the field (of the regions) that differ.
 """
 
 from __future__ import annotations
@@ -263,6 +267,46 @@ def add_waits(report: Report, trained: Path, before: Path, folder: Path, quick: 
         )
 
 
+def add_lifts_in_turns(report: Report, trained: Path, before: Path, folder: Path, kinds: Sequence[str]) -> None:
+    """Add lifts of this checkout and of another one, in turns, and whether their results are the same.
+
+    Lifts of colors and patches have every stage cached. Lifts of edges start with an empty cache, kernels compiled.
+    """
+    checkouts = {"now": HERE, "before": before}
+    folders = {name: folder / name for name in checkouts}
+    data = trained.parents[4] / trained.parents[2].name
+    clip = make_weights(folder, ["fox"]) if "patches" in kinds else ()
+    flags = {
+        "colors": ("--encoder", "color"),
+        "patches": ("--regions", "patches", *clip),
+        "edges": ("--regions", "edges", "--encoder", "imagenet"),
+    }
+    keys = {"colors": "cached_lift", "patches": "cached_patches_lift", "edges": "edges_lift"}
+
+    def lift(name: str, kind: str, output: str) -> dict[str, float]:
+        given = ("--data", data, "--timestamp", "run", "--overwrite", True, *flags[kind])
+        return lifted(trained, folders[name], output, *given, checkout=checkouts[name])
+
+    for kind in kinds:
+        taken: dict[str, list[dict[str, float]]] = {name: [] for name in checkouts}
+        for name in checkouts:
+            lift(name, kind, f"{kind}0")
+        for turn in range(3):
+            for name, found in taken.items():
+                found.append(lift(name, kind, f"{kind}{turn + 1 if kind == 'edges' else 0}"))
+        what = "*/normlift/.cache/regions/*" if kind == "edges" else "*/normlift/run/normlift/field.safetensors"
+        now, earlier = (sorted((folders[name] / f"{kind}0").glob(what)) for name in checkouts)
+        assert [file.name for file in now] == [file.name for file in earlier] != []
+        differ = sum(a.read_bytes() != b.read_bytes() for a, b in zip(now, earlier)) / len(now)
+        for name, found in taken.items():
+            for stage in found[0]:
+                seconds = [one[stage] for one in found]
+                key = f"{name}.{keys[kind]}_s" if stage == "wall" else f"{name}.{keys[kind]}.{stage}_s"
+                error = differ if stage == "wall" and name == "now" else None
+                unit = f"s, {min(seconds):.4g} to {max(seconds):.4g}"
+                report.add(key, statistics.median(seconds), unit, error)
+
+
 def joined(report: Report, file: Path) -> Report:
     """Return the report with the machine in every unit, and with the other metrics of an existing file."""
     here = [replace(metric, unit=f"{metric.unit}; {hardware()}") for metric in report.metrics]
@@ -273,10 +317,12 @@ def joined(report: Report, file: Path) -> Report:
     )
 
 
-def main(trained: Path, quick: bool, before: Path | None, output: Path) -> None:
+def main(trained: Path, quick: bool, before: Path | None, kinds: Sequence[str], output: Path) -> None:
     report = Report("command")
     with tempfile.TemporaryDirectory() as name:
-        if before is not None:
+        if before is not None and len(kinds) > 0:
+            add_lifts_in_turns(report, trained.absolute(), before.absolute(), Path(name), kinds)
+        elif before is not None:
             add_waits(report, trained.absolute(), before.absolute(), Path(name), quick)
         elif torch.cuda.is_available():
             add_lifts(report, trained.absolute(), Path(name), 2 if quick else 3)
@@ -290,6 +336,9 @@ if __name__ == "__main__":
     parser.add_argument("--config", type=Path, default=FOX, help="config.yml of a trained run; by default the fox")
     parser.add_argument("--quick", action="store_true", help="fewer runs")
     parser.add_argument("--before", type=Path, help="another checkout, whose times with colors are compared")
+    parser.add_argument(
+        "--lifts", nargs="+", default=(), choices=("colors", "patches", "edges"), help="only these lifts"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
-    main(arguments.config, arguments.quick, arguments.before, arguments.output)
+    main(arguments.config, arguments.quick, arguments.before, arguments.lifts, arguments.output)

@@ -239,7 +239,7 @@ def compare_rooms(report: Report, names: Sequence[str]) -> None:
 
 
 def main(quick: bool, rooms_only: bool, output: Path) -> None:
-    report = Report("h100_rooms" if rooms_only else "h100")
+    report = Report("gpu_rooms" if rooms_only else "h100")
     if rooms_only:
         compare_rooms(report, ("rooms_1930k", "rooms_10m"))
         report.write(output)

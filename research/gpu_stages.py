@@ -15,11 +15,11 @@ from normlift_ns import Evidence
 from normlift_ns.rasterization import triton
 
 STAGES = (
-    ("projection", triton, "project"),
-    ("lists", triton, "list_cells"),
-    ("sums", triton, "region_sums"),
+    ("projection", triton, "_project"),
+    ("lists", triton, "build_cell_lists"),
+    ("sums", triton, "sum_regions"),
     ("merging", triton, "sum_equal_keys"),
-    ("places", triton, "places"),
+    ("places", triton, "decode_keys"),
     ("assembly", Evidence, "join"),
 )
 

@@ -11,7 +11,9 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, fields
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Group
@@ -128,8 +130,10 @@ class NormLift(CheckedOptions):
             if code > 0:
                 sys.exit(code)
             return None
-        with join_processes(self.device) as team:
-            return self._lift(team)
+        with frequent_switches():
+            load_drivers(self.device)
+            with join_processes(self.device) as team:
+                return self._lift(team)
 
     def request(self, **more: Any) -> LiftRequest:
         """Return the lift request for these options.
@@ -310,6 +314,50 @@ def keep_freed_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(_M_MMAP_MAX, 0)
         mallopt(_M_TRIM_THRESHOLD, -1)
+
+
+@contextmanager
+def frequent_switches() -> Iterator[None]:
+    """Let threads take turns ten times as often, so that one that reads files does not wait for one that imports."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(interval / 10)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(interval)
+
+
+def load_drivers(device: str) -> None:
+    """Start to initialize CUDA and to load Triton in background threads, while torch is imported.
+
+    Torch would do both later, and hold Python's global lock. Errors are ignored here. They occur again at the first use
+    of the GPU.
+
+    Args:
+        device: Device to lift on: cpu, cuda, cuda:N or auto.
+    """
+    if device == "cpu":
+        return
+    with suppress(OSError):  # this machine has no CUDA
+        cuda = ctypes.CDLL("libcuda.so.1")
+        Thread(target=_load_triton, name="load-triton", daemon=True).start()
+        if rank_and_world_size(os.environ) is None:  # processes of a distributed lift choose their GPU later
+            number = int(device.partition(":")[2] or 0)
+            Thread(target=_start_cuda, args=(cuda, number), name="start-cuda", daemon=True).start()
+
+
+def _load_triton() -> None:
+    """Import Triton, and compute the hash of its files, which all kernels need."""
+    with suppress(Exception):
+        import_module("triton.runtime.cache").triton_key()
+
+
+def _start_cuda(cuda: ctypes.CDLL, number: int) -> None:
+    """Create the context that torch uses on a GPU."""
+    gpu, context = ctypes.c_int(), ctypes.c_void_p()
+    with suppress(AttributeError):
+        if cuda.cuInit(0) == 0 and cuda.cuDeviceGet(ctypes.byref(gpu), number) == 0:
+            cuda.cuDevicePrimaryCtxRetain(ctypes.byref(context), gpu)
 
 
 def _views(count: int) -> str:

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from itertools import islice
-from threading import Lock, Thread
+from threading import Lock, RLock, Thread
 from typing import Any, TypeVar, cast
 
 import torch
@@ -26,6 +26,18 @@ Items = TypeVar("Items", Sequence, Tensor)  # pyright: ignore[reportMissingTypeA
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Record = TypeVar("Record")
+
+
+class shared_property(cached_property[Result]):
+    """A `cached_property` that threads may request at the same time; the others wait for the first."""
+
+    def __init__(self, function: Callable[[Any], Result]) -> None:
+        super().__init__(function)
+        self._lock = RLock()
+
+    def __get__(self, instance: Any, owner: Any = None) -> Any:
+        with self._lock:
+            return super().__get__(instance, owner)
 
 
 class TensorRecord:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import json
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
 from statistics import fmean, median
 from typing import NamedTuple
 
@@ -15,6 +18,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.data.misfit import explain_misfit
 from normlift_ns.data.reduced_views import ReducedView, sample_views
 from normlift_ns.errors import InputError
+from normlift_ns.io.arrays import array_digest, load_arrays, save_arrays
 from normlift_ns.rasterization.settings import RasterSettings
 
 MIN_PSNR = 24.0
@@ -24,6 +28,8 @@ MIN_MARGIN = 3.0
 and at least 4 dB for cameras in the right world."""
 _MIN_VISIBLE = 0.001
 """Minimum `Alignment.visible_fraction`."""
+_CACHE_VERSION = "normlift_ns.alignment/1"
+"""Version in every cache key; increase it when `cached_alignment` changes for the same input."""
 
 
 class Alignment(NamedTuple):
@@ -79,6 +85,45 @@ def measure_alignment(
     is_flat = gaussians.primitive == "2dgs"
     other = None if match.is_usual or is_flat or scene.renderer is not None else render_flat
     return match._replace(cause=explain_misfit(views, renders, other, MIN_PSNR, MIN_MARGIN))
+
+
+def cached_alignment(
+    scene: Scene, settings: RasterSettings, folder: Path, *, device: str, wait_for_kernels: Callable[[], None]
+) -> Alignment:
+    """Return the result of `measure_alignment` from a cache, or compute and store it.
+
+    Results of different devices count as equal, because they differ only by rounding.
+
+    Args:
+        folder: Folder of the cache. It may be missing or read-only.
+        wait_for_kernels: Called before views are rendered.
+        scene, settings, device: As in `measure_alignment`.
+    """
+    path = None if scene.renderer is not None else folder / f"{_alignment_key(scene, settings)}.safetensors"
+    if path is not None and path.is_file():
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            psnr, worst, *rest = json.loads(load_arrays(path, key=path.stem).metadata["alignment"])
+            return Alignment(psnr, tuple(worst), *rest)
+    wait_for_kernels()
+    match = measure_alignment(scene, settings, device=device)
+    if path is not None:
+        with suppress(OSError):
+            save_arrays(path, {}, {"alignment": json.dumps(match)}, key=path.stem, overwrite=True)
+    return match
+
+
+def _alignment_key(scene: Scene, settings: RasterSettings) -> str:
+    """Return a digest of everything that `measure_alignment` depends on, except the device."""
+    gaussians, views = scene.gaussians, [small.view for small in sample_views(scene)]
+    arrays = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities")}
+    arrays["background"] = scene.background
+    for number, view in enumerate(views):
+        camera = view.camera
+        parts = {"image": view.image, "mask": view.mask, "K": camera.K, "pose": camera.world_to_camera}
+        parts["colors"] = scene.colors(camera)
+        arrays |= {f"{name} {number}": part for name, part in parts.items() if part is not None}
+    facts = [_CACHE_VERSION, gaussians.primitive, scene.rasterize_mode, asdict(settings), [view.name for view in views]]
+    return array_digest(arrays, {"facts": json.dumps(facts)}).rpartition(":")[2]
 
 
 def _compare(

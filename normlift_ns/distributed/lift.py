@@ -50,8 +50,9 @@ def run_lift_distributed(team: TorchCommunicator, request: pipeline.LiftRequest)
     if team.rank == 0:
         pipeline.check_target(prepared)
     pipeline.announce(prepared)
+    pipeline.load_networks(prepared.source, cache_folder(run_dir))
     if team.rank == 0:
-        pipeline.check_alignment(prepared, before, lambda: None)
+        pipeline.check_alignment(prepared, before, pipeline.KernelWarmUp())
     cache, device = cache_folder(run_dir), prepared.device
     collection = pipeline.plan_collection(
         prepared.scene, prepared.source, prepared.lift, cache, device=device, export=request.export
@@ -59,6 +60,7 @@ def run_lift_distributed(team: TorchCommunicator, request: pipeline.LiftRequest)
     stages, facts = StageTimer(team.aggregate_progress(request.report)), {}
     options, means = collection.options, collection.gaussians.means
     kernels = pipeline.start_kernel_warm_up(collection.scene, collection.gaussians, options, collection.config)
+    kernels.start_rasterization()
     portion = Partition.from_means(team, means)
     with team.shared_folder(cache):
         views = _collect(team, collection, portion, stages, kernels)

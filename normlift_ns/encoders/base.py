@@ -159,8 +159,8 @@ class Regions(Protocol):
 
     @property
     def at_once(self) -> int:
-        """Number of images to segment concurrently, one per thread; 1 for a network, because one image is enough to
-        use its device fully."""
+        """Number of images to segment concurrently, one per thread; 1 if one image is enough to use the device
+        fully."""
         ...
 
     def files(self, name: str) -> tuple[Path, ...]:
@@ -231,9 +231,8 @@ class RegionFeatures:
 
         def selected_levels() -> Iterator[tuple[Tensor, Tensor]]:
             chosen = list(self.regions.chosen or (0,))
-            for image, maps in prefetch_map(self._segment, images, self.regions.at_once):
-                cells, regions = joint_partition(maps[:, 0])
-                pending.append((cells.cpu(), regions[chosen].cpu()))
+            for image, maps, cells, regions in prefetch_map(self._segment, images, self.regions.at_once):
+                pending.append((cells, regions[chosen]))
                 for level in chosen:
                     yield image, maps[level]
 
@@ -246,8 +245,12 @@ class RegionFeatures:
                 cells, *drop_zero_rows(torch.cat(features), torch.where(regions >= 0, regions + offsets, -1))
             )
 
-    def _segment(self, view: tuple[Tensor, str]) -> tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "levels depth h w"]]:
-        """Return the image on the CPU and its label maps.
+    def _segment(
+        self, view: tuple[Tensor, str]
+    ) -> tuple[
+        UInt8[Tensor, "h w 3"], Int32[Tensor, "levels depth h w"], Int32[Tensor, "h w"], Int32[Tensor, "levels c"]
+    ]:
+        """Return the image on the CPU, its label maps, and its cells on the CPU with their regions in each level.
 
         Raises:
             InputError: If the image is invalid, a selected level is missing, or no level of several is selected.
@@ -261,7 +264,9 @@ class RegionFeatures:
             origin = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
             levels = "only level 0" if len(maps) == 1 else f"the levels 0..{len(maps) - 1}"
             raise InputError(f"{origin} has {levels}; select a level of the regions with --level")
-        return image, maps if self.filled is None else _limit_regions(maps, self.filled(name, *image.shape[:2]))
+        maps = maps if self.filled is None else _limit_regions(maps, self.filled(name, *image.shape[:2]))
+        cells, regions = joint_partition(maps[:, 0])
+        return image, maps, cells.cpu(), regions.cpu()
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
         return self.encoder.text(prompts)
@@ -305,8 +310,9 @@ def iterate_view_features(
 
     The iterator reads ahead in `images` if the source segments or encodes several images together.
     """
-    if isinstance(source, RegionFeatures):
-        return source.views(images)
+    if hasattr(source, "views") and not isinstance(source, PrecomputedFeatures):
+        several: Any = source
+        return several.views(images)
     return (source.view(image, name) for image, name in images)
 
 
@@ -339,14 +345,11 @@ def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h
         key, key_count = key * count + labels + 1, key_count * count
         if len(maps) > 2:  # keep the product of the region counts within 64 bits
             key, key_count = _renumber(key, key_count)
-    cells, count = _renumber(key, key_count)
+    number, count = _renumber(key, key_count)
     unlabeled = int((maps == -1).all(dim=0).any())  # these pixels have key 0, the smallest
-    cells = cells - unlabeled
-    regions = torch.empty(len(maps), count - unlabeled, dtype=torch.int32, device=maps.device)
-    labeled = cells >= 0
-    for level, labels in enumerate(maps):
-        regions[level, cells[labeled]] = labels[labeled]
-    return cells.int(), regions
+    regions = torch.empty(len(maps), count, dtype=torch.int32, device=maps.device)
+    regions.scatter_(1, number.flatten().expand(len(maps), -1), maps.flatten(1).int())  # equal keys, equal labels
+    return (number - unlabeled).int(), regions[:, unlabeled:].contiguous()
 
 
 def _renumber(key: Int64[Tensor, "h w"], key_count: int) -> tuple[Int64[Tensor, "h w"], int]:

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float32, Int32, UInt8
 from torch import Tensor
 
+from normlift_ns.core.device import prefetch_map
 from normlift_ns.encoders.base import FeatureSource, PatchFeatures, RegionFeatures, ViewFeatures, drop_zero_rows
 from normlift_ns.encoders.text_files import UNIT_TOLERANCE, cache_path
 from normlift_ns.errors import InputError
@@ -28,6 +29,10 @@ from normlift_ns.io.guard import read_file
 from normlift_ns.segmentation.sam3 import Sam3Network, sam3_identity
 
 REMEDY = "copy it from where the scene was lifted, or lift again with the same options: ns-normlift"
+
+
+_READERS = 8
+"""Number of cached images that are read in parallel."""
 
 
 class NotCachedError(InputError):
@@ -137,14 +142,28 @@ class CachedPatches(_Cached):
     """
 
     def view(self, image: UInt8[Tensor, "h w 3"], name: str) -> ViewFeatures:
-        path = cache_path(self.folder, self.identity, *_key_parts(image))
-        labels = self.inner.labels(image)
-        features = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1), self.compute)
-        if features is None:
-            features = self.inner.features(image, name)
-            _write(path, "features", features)
-        features, labels = drop_zero_rows(features, labels)
-        return ViewFeatures(labels, features)
+        return next(self.views([(image, name)]))
+
+    def views(self, images: Iterable[tuple[UInt8[Tensor, "h w 3"], str]]) -> Iterator[ViewFeatures]:
+        """Yield the features of several images; see `iterate_view_features`."""
+
+        def combine(labels: Tensor, features: Tensor) -> ViewFeatures:
+            features, labels = drop_zero_rows(features, labels)
+            return ViewFeatures(labels, features)
+
+        def look_up(view: tuple[Tensor, str]) -> tuple[Tensor, str, Path, Tensor, ViewFeatures | None]:
+            image, name = view
+            path, labels = cache_path(self.folder, self.identity, *_key_parts(image)), self.inner.labels(image)
+            features = _read(path, "features", partial(_are_units, count=int(labels.max()) + 1), self.compute)
+            return image, name, path, labels, None if features is None else combine(labels, features)
+
+        for image, name, path, labels, found in prefetch_map(look_up, images, _READERS):
+            if found is not None:
+                yield found
+            else:
+                features = self.inner.features(image, name)
+                _write(path, "features", features)
+                yield combine(labels, features)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ import importlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, cast
 
 import torch
@@ -24,6 +23,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import linear
 
+from normlift_ns.core.device import shared_property
 from normlift_ns.encoders import huggingface
 from normlift_ns.encoders.crops import NetworkEncoder
 from normlift_ns.encoders.weights import third_party_errors
@@ -255,12 +255,12 @@ class HuggingFaceEncoder(NetworkEncoder):
     def _check_names(self) -> None:
         huggingface.check_model_name(self.model, self.family)
 
-    @cached_property
+    @shared_property
     def _identity(self) -> dict[str, Any]:
         """Settings that change image features. Files are identified by their content, and downloaded if missing."""
         return {"kind": self.family.name, "weights": file_digest(*self._folder.files), "fill": self.fill}
 
-    @cached_property
+    @shared_property
     def network(self) -> HuggingFaceNetwork:
         return load_huggingface_network(self._folder, self.family, self.device)
 
@@ -275,6 +275,6 @@ class HuggingFaceEncoder(NetworkEncoder):
             )
         return text
 
-    @cached_property
+    @shared_property
     def _folder(self) -> huggingface.ModelFolder:
         return huggingface.read_model_folder(huggingface.fetch_model(self.model, self.family), self.family)

@@ -172,7 +172,7 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
             does not have the image encoder of the model. Also if the name of the weights is an existing folder.
         FileNotFoundError: If the name of the weights can only be a path, and the path does not exist.
     """
-    config, tags = open_clip_model_config(model), import_open_clip_module("pretrained")
+    config = open_clip_model_config(model)
     if config is None:
         near = ", ".join(difflib.get_close_matches(model, open_clip_model_names()) or [DEFAULT_MODEL])
         raise InputError(
@@ -186,7 +186,10 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
             f"{timm.__version__} does not have it (nerfstudio pins an old version). Use a model without timm, "
             f"such as {DEFAULT_MODEL} or ViT-L-14, or install another timm version at your own risk"
         )
-    if os.path.isfile(pretrained) or tags.is_pretrained_cfg(model, pretrained):
+    if os.path.isfile(pretrained):
+        return
+    tags = import_open_clip_module("pretrained")  # imports huggingface_hub, which takes 0.2 s
+    if tags.is_pretrained_cfg(model, pretrained):
         return
     check_not_local(pretrained, 1, "--encoder-pretrained", "not a weight file of an OpenCLIP model", OPEN_CLIP_REMEDY)
     known = ", ".join(tags.list_pretrained_tags_by_model(model))

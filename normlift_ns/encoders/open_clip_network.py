@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Float, Float32, Int64
 from safetensors import safe_open
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import gelu, interpolate, layer_norm, linear, normalize, scaled_dot_product_attention
 
+from normlift_ns.core.device import shared_property
 from normlift_ns.encoders.crops import NetworkEncoder
 from normlift_ns.encoders.open_clip import (
     OPEN_CLIP_REMEDY,
@@ -30,6 +32,8 @@ from normlift_ns.encoders.weights import CONNECT_ONCE, third_party_errors
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.io.guard import check_regular
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, CropFill
+
+_init_lock = Lock()
 
 
 class OpenClipNetwork(NamedTuple):
@@ -65,6 +69,21 @@ class OpenClipNetwork(NamedTuple):
         return self.model.encode_text(self.tokenizer(list(texts)).to(self.mean.device))
 
 
+@contextmanager
+def _uninitialized() -> Iterator[None]:
+    """Leave weights without the random values of `torch.nn.init`, which take seconds, until a file replaces them."""
+    names = ("kaiming_uniform_", "normal_", "uniform_")
+    with _init_lock:
+        kept = {name: getattr(nn.init, name) for name in names}
+        try:
+            for name in names:
+                setattr(nn.init, name, lambda tensor, *_, **__: tensor)
+            yield
+        finally:
+            for name, function in kept.items():
+                setattr(nn.init, name, function)
+
+
 def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
     """Load a network whose architecture and weights have passed `check_open_clip_names`.
 
@@ -75,9 +94,12 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
     """
     open_clip = import_open_clip()
     path, training = find_open_clip_weights(model, pretrained)
-    with third_party_errors(
-        f"OpenCLIP model {model} cannot be built with the packages installed here",
-        f"choose another model with --encoder-model, such as {DEFAULT_MODEL}",
+    with (
+        _uninitialized(),
+        third_party_errors(
+            f"OpenCLIP model {model} cannot be built with the packages installed here",
+            f"choose another model with --encoder-model, such as {DEFAULT_MODEL}",
+        ),
     ):
         network = open_clip.create_model(
             model,
@@ -163,7 +185,7 @@ class OpenClipEncoder(NetworkEncoder):
     def _check_names(self) -> None:
         check_open_clip_names(self.model, self.pretrained)
 
-    @cached_property
+    @shared_property
     def _identity(self) -> dict[str, Any]:
         path = Path(self.pretrained)
         weights = file_digest(path) if path.is_file() else self.pretrained
@@ -179,7 +201,7 @@ class OpenClipEncoder(NetworkEncoder):
             f"Use --encoder-model {DEFAULT_MODEL}, or other regions"
         )
 
-    @cached_property
+    @shared_property
     def network(self) -> OpenClipNetwork:
         return load_open_clip(self.model, self.pretrained, self.device)
 

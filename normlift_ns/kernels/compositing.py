@@ -330,11 +330,11 @@ def _number_labels(
 
 @triton.jit(do_not_specialize=["first_cell", "first_slot", "columns"])
 def _sum_regions(
-    splats, members, offsets, local, table, counts, base, out_key, out_weight, out_used,
+    splats, members, offsets, local, table, counts, base, order, out_key, out_weight, out_used,
     first_cell, first_slot, columns, cells_across, cells, max_alpha, min_alpha, min_transmittance,
     POWER: tl.constexpr, IS_2D: tl.constexpr, CELL_W: tl.constexpr, CELL_H: tl.constexpr, UNROLL: tl.constexpr,
 ):  # fmt: skip
-    cell = first_cell + tl.program_id(0).to(tl.int64)
+    cell = first_cell + tl.load(order + tl.program_id(0))
     start, stop = tl.load(offsets + cell), tl.load(offsets + cell + 1)
     count = tl.load(counts + cell)
     first = (tl.load(base + cell) - first_slot).to(tl.int32)
@@ -440,9 +440,11 @@ def sum_regions(
         key = torch.empty(high - low, dtype=dtype, device=device)
         weight = torch.empty(high - low, device=device)
         used = torch.empty(last - first, dtype=torch.int32, device=device)
+        # The longest lists come first, because a long list at the end would occupy the GPU alone.
+        order = lists.offsets[first : last + 1].diff().argsort(descending=True)
         _sum_regions[(last - first,)](
-            splats.view(torch.int64), lists.members, lists.offsets, local, table, counts, slots, key, weight, used,
-            first, low, columns, grid.across, grid.cells, *limits,
+            splats.view(torch.int64), lists.members, lists.offsets, local, table, counts, slots, order, key, weight,
+            used, first, low, columns, grid.across, grid.cells, *limits,
             POWER=weight_power, IS_2D=splats.shape[1] == SPLAT_2D, UNROLL=UNROLL, **shape,
         )  # fmt: skip
         ends = used.cumsum(0)

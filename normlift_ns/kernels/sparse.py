@@ -11,6 +11,8 @@ from jaxtyping import Float, Float32, Float64, Int32, Int64
 from torch import Tensor
 
 _ROWS = 128
+_VECTORS = 16
+"""Number of sums of vectors per program. With one, starting the programs takes as long as the sums."""
 
 
 class RowNorms(NamedTuple):
@@ -100,13 +102,25 @@ def _store_norms(
     tl.store(out_views + j, views)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["rows"])
 def _row_norms(
     offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
-    dimension, min_share, max_entries, BLOCK: tl.constexpr,
+    rows, dimension, min_share, max_entries, VECTORS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Compute one row per program. Repeat a sum in float64 if its terms nearly cancel or are many."""
-    j = tl.program_id(0)
+    first = tl.program_id(0) * VECTORS
+    for j in range(first, tl.minimum(first + VECTORS, rows)):
+        _norms_of_row(
+            offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
+            j, dimension, min_share, max_entries, BLOCK,
+        )  # fmt: skip
+
+
+@triton.jit
+def _norms_of_row(
+    offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
+    j, dimension, min_share, max_entries, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Compute one row. Repeat a sum in float64 if its terms nearly cancel or are many."""
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
     if stop - start <= 1:  # no vector sum is needed, because rows of the table are unit vectors
         only = tl.load(weight + start, mask=start < stop, other=0.0).to(tl.float64)
@@ -184,18 +198,28 @@ def row_norms(
         *(torch.empty(n, dtype=torch.float64, device=device) for _ in range(4)),
         torch.empty(n, dtype=torch.int32, device=device),
     )
-    _row_norms[(n,)](
-        offsets, column, weight, column_view, table, *out, dimension, min_share, max_entries,
-        BLOCK=triton.next_power_of_2(dimension), num_warps=1,
+    _row_norms[(triton.cdiv(n, _VECTORS),)](
+        offsets, column, weight, column_view, table, *out, n, dimension, min_share, max_entries,
+        VECTORS=_VECTORS, BLOCK=triton.next_power_of_2(dimension), num_warps=1,
     )  # fmt: skip
     return out
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _unit_sums(
-    rows, offsets, column, weight, table, norms, out, dimension, min_share, max_entries, BLOCK: tl.constexpr
+    rows, offsets, column, weight, table, norms, out, count, dimension, min_share, max_entries,
+    VECTORS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    first = tl.program_id(0).to(tl.int64) * VECTORS
+    for i in range(first, tl.minimum(first + VECTORS, count)):
+        _unit_sum(rows, offsets, column, weight, table, norms, out, i, dimension, min_share, max_entries, BLOCK)
+
+
+@triton.jit
+def _unit_sum(
+    rows, offsets, column, weight, table, norms, out, i, dimension, min_share, max_entries, BLOCK: tl.constexpr
 ):
-    j = tl.load(rows + tl.program_id(0))
+    j = tl.load(rows + i)
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
     d = tl.arange(0, BLOCK)
     total = tl.zeros([BLOCK], tl.float32)
@@ -212,7 +236,7 @@ def _unit_sums(
             total = (exact / tl.sqrt(tl.sum(exact * exact, axis=0))).to(tl.float32)
         else:
             total = total / norm
-    tl.store(out + tl.program_id(0).to(tl.int64) * dimension + d, total.to(out.dtype.element_ty), mask=d < dimension)
+    tl.store(out + i * dimension + d, total.to(out.dtype.element_ty), mask=d < dimension)
 
 
 def unit_sums(
@@ -242,9 +266,9 @@ def unit_sums(
     dimension = table.shape[1]
     out = torch.empty(len(rows), dimension, dtype=dtype, device=table.device)
     if len(rows) > 0:
-        _unit_sums[(len(rows),)](
-            rows, offsets, column, weight, table, norms, out, dimension, min_share, max_entries,
-            BLOCK=triton.next_power_of_2(dimension), num_warps=1,
+        _unit_sums[(triton.cdiv(len(rows), _VECTORS),)](
+            rows, offsets, column, weight, table, norms, out, len(rows), dimension, min_share, max_entries,
+            VECTORS=_VECTORS, BLOCK=triton.next_power_of_2(dimension), num_warps=1,
         )  # fmt: skip
     return out
 

@@ -15,7 +15,7 @@ import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from threading import Lock
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -24,9 +24,10 @@ from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d
 
+from normlift_ns.core.device import shared_property
 from normlift_ns.encoders.weights import EDGES, third_party_errors
 from normlift_ns.errors import InputError
-from normlift_ns.segmentation.regions import RegionDefaults, resample_nearest
+from normlift_ns.segmentation.regions import WORKERS, RegionDefaults, resample_nearest
 from normlift_ns.segmentation.sam import resize_bilinear
 
 WORKING_PIXELS = 2**18
@@ -44,6 +45,7 @@ _MARGIN = 16
 """Width of the mirrored margin around an image, in pixels. Without it, the network detects edges along the border."""
 _HEIGHTS = 256
 """Number of possible values of an edge map. A small number hides the different rounding errors of devices."""
+_network_lock = Lock()
 ALGORITHM = 2
 """Part of the cache key of regions. Increase it with each change of this module that changes regions."""
 
@@ -76,9 +78,9 @@ class EdgeNetwork(nn.Module):
         for number, (block, side) in enumerate(zip(self.blocks, self.sides)):
             pixels = max_pool2d(pixels, 2, ceil_mode=True) if number > 0 else pixels
             for convolution in block:
-                pixels = convolution(pixels).relu_()
-            maps.append(interpolate(side(pixels), image.shape[:2], mode="bilinear", align_corners=False))
-        return self.fuse(torch.cat(maps, dim=1))[0, 0].sigmoid()
+                pixels = _convolve(convolution, pixels).relu_()
+            maps.append(interpolate(_convolve(side, pixels), image.shape[:2], mode="bilinear", align_corners=False))
+        return _convolve(self.fuse, torch.cat(maps, dim=1))[0, 0].sigmoid()
 
     def layers(self) -> Iterator[tuple[str, nn.Conv2d]]:
         """Yield the convolutions with their names in Keras files."""
@@ -87,6 +89,20 @@ class EdgeNetwork(nn.Module):
                 yield f"block{number}/layers/conv2d{f'_{i}' if i > 0 else ''}", convolution
             yield f"dsn{number}", side
         yield "fuse", self.fuse
+
+
+def _convolve(layer: Any, pixels: Float32[Tensor, "1 c h w"]) -> Float32[Tensor, "1 d h w"]:
+    """Return the convolution, on a GPU always with the same algorithm and in float32.
+
+    The switches of `torch.backends.cudnn` would also change networks that run in other threads.
+    """
+    if not pixels.is_cuda:
+        return layer(pixels)
+    shape = (layer.padding, layer.stride, layer.dilation, layer.groups)
+    product = torch.cudnn_convolution(
+        pixels, layer.weight, *shape, benchmark=False, deterministic=True, allow_tf32=False
+    )
+    return product.add_(layer.bias[:, None, None])
 
 
 def read_edge_weights(network: EdgeNetwork, content: bytes) -> None:
@@ -183,6 +199,8 @@ def _lowest_passes(basins: Int64[np.ndarray, "h w"], edges: UInt8[np.ndarray, "h
 class EdgeRegions(RegionDefaults):
     """Regions between the edges that HED detects. Weights are loaded on first use.
 
+    Threads share the network, one image at a time, and compute the watersheds of several images concurrently.
+
     The regions of an image are reproducible on the same device. Other devices and thread counts change the rounding of
     the network, and thereby single pixels of the edge map.
     """
@@ -195,6 +213,8 @@ class EdgeRegions(RegionDefaults):
     """Device of the network."""
     pixels: int = WORKING_PIXELS
     """Approximate largest number of pixels of the network input."""
+
+    at_once = WORKERS
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -228,11 +248,11 @@ class EdgeRegions(RegionDefaults):
         pixels = resize_bilinear(image.to(self.device), height, width).cpu().numpy()
         margins = ((_MARGIN, _MARGIN), (_MARGIN, _MARGIN), (0, 0))
         mirrored = torch.from_numpy(np.pad(pixels, margins, mode="reflect")).to(self.device)
-        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
+        with _network_lock:
             strength = self.network(mirrored)[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
         return (strength * (_HEIGHTS - 1)).round().to(torch.uint8).cpu().numpy()
 
-    @cached_property
+    @shared_property
     def network(self) -> EdgeNetwork:
         """The network with its weights, loaded on first use. Raises the same errors as `edges`."""
         network = EdgeNetwork()

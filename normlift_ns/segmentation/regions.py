@@ -84,7 +84,7 @@ def gray_bit_depth(path: Path) -> int | None:
 _MAP_SUFFIXES, _MAP_FORMATS = (".png", ".npy"), ("PNG",)
 _MAX_MAP_BYTES = 2**31
 """Largest size of a label map file, in bytes."""
-_WORKERS = min(8, os.cpu_count() or 1)
+WORKERS = min(8, os.cpu_count() or 1)
 """Number of images to segment concurrently. Superpixels need many times the memory of their image."""
 
 
@@ -109,7 +109,7 @@ class Superpixels(RegionDefaults):
     """Approximate number of superpixels per image, at least 1. An image has at most one per pixel."""
     device: str = "cpu"
 
-    at_once = _WORKERS
+    at_once = WORKERS
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -168,7 +168,7 @@ class LabelFiles(RegionDefaults):
     flag: str = "--regions-dir"
     """Option that sets the folder, for messages."""
 
-    at_once = _WORKERS
+    at_once = WORKERS
 
     def __post_init__(self) -> None:
         if not os.path.isdir(self.folder):

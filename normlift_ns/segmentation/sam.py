@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache, partial
 from itertools import product
+from threading import Lock
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -20,7 +21,7 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn.functional import gelu, interpolate, layer_norm, linear, pad, scaled_dot_product_attention
 
-from normlift_ns.core.device import AdaptiveBatches, can_use_triton
+from normlift_ns.core.device import AdaptiveBatches, can_use_triton, shared_property
 from normlift_ns.options import DEFAULT_SAM, SamPrecision
 from normlift_ns.segmentation import mask_filtering
 from normlift_ns.segmentation.checkpoint import (
@@ -33,6 +34,7 @@ from normlift_ns.segmentation.checkpoint import (
 from normlift_ns.segmentation.regions import RegionDefaults, stack_masks
 
 _BITS = 22
+_network_lock = Lock()
 
 
 def resize_bilinear(image: UInt8[Tensor, "h w c"], height: int, width: int) -> UInt8[Tensor, "height width c"]:
@@ -598,6 +600,8 @@ class _Candidates(NamedTuple):
 class SamMasks(RegionDefaults):
     """Regions from one level of SAM's automatic masks. Weights are loaded on first use.
 
+    The network segments one image at a time, while another thread prepares the maps of the image before.
+
     Raises:
         ValueError: If transformers is not installed or too old, or the checkpoint is neither a path nor a hub name, or
             belongs to another network.
@@ -614,6 +618,8 @@ class SamMasks(RegionDefaults):
     """Precision of the network. "auto" selects float16 on a GPU and float32 on a CPU."""
     rules: MaskRules = field(default_factory=MaskRules)
 
+    at_once = 2
+
     def __post_init__(self) -> None:
         check_sam_checkpoint(self.checkpoint)
 
@@ -629,7 +635,8 @@ class SamMasks(RegionDefaults):
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
         """Return label maps of the levels default, s, m and l, on the device. Raises the same errors as `masks`."""
-        maps = [stack_masks(masks) for masks in self.masks(image).values()]
+        with _network_lock:
+            maps = [stack_masks(masks) for masks in self.masks(image).values()]
         depth = max(len(labels) for labels in maps)
         return torch.stack([pad(labels, (0, 0, 0, 0, 0, depth - len(labels)), value=-1) for labels in maps])
 
@@ -709,11 +716,11 @@ class SamMasks(RegionDefaults):
     def _crop_masks(self, size: tuple[int, int], logits: Tensor) -> Tensor:
         return self.network.enlarge(logits, size) > 0
 
-    @cached_property
+    @shared_property
     def _checkpoint(self) -> str:
         return sam_identity(self.checkpoint)
 
-    @cached_property
+    @shared_property
     def network(self) -> PromptedNetwork:
         """The network with its weights, loaded on first use. Raises the same errors as `masks`."""
         return load_sam_network(self.checkpoint, self.device, self.precision)

@@ -2,14 +2,14 @@
 
 from collections.abc import Iterable
 from itertools import islice, product
-from threading import get_ident
+from threading import Barrier, get_ident
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from normlift_ns.core.device import AdaptiveBatches, prefetch_map
+from normlift_ns.core.device import AdaptiveBatches, prefetch_map, shared_property
 
 
 def narrow(room: int):
@@ -101,3 +101,22 @@ def test_items_are_asked_for_in_the_thread_of_the_caller() -> None:
         worked = list(prefetch_map(lambda _: get_ident(), items, threads))
         assert set(asked) == {get_ident()}
         assert (set(worked) == {get_ident()}) is ours
+
+
+def test_threads_that_ask_together_share_one_value() -> None:
+    together, made = Barrier(4), []
+
+    class Owner:
+        @shared_property
+        def network(self) -> object:
+            made.append(object())
+            return made[-1]
+
+    owner = Owner()
+
+    def ask(_: int) -> object:
+        together.wait()
+        return owner.network
+
+    found = list(prefetch_map(ask, range(4), 4))
+    assert len(made) == 1 and all(value is made[0] for value in found) and vars(owner) == {"network": made[0]}

@@ -12,8 +12,10 @@ import torch
 
 from normlift_ns import InputError, open_scene
 from normlift_ns.core.scene import View
-from normlift_ns.data.alignment import Alignment, alignment_warning, measure_alignment
+from normlift_ns.data import alignment
+from normlift_ns.data.alignment import Alignment, alignment_warning, cached_alignment, measure_alignment
 from normlift_ns.rasterization.rasterize import render_image
+from normlift_ns.rasterization.settings import RasterSettings
 from tests.captures import SHARED, needs_shared
 from tests.random_scenes import generator
 
@@ -47,6 +49,26 @@ def noisy(view: View) -> View:
 @pytest.fixture(scope="module")
 def scene(trained: Path):
     return open_scene(trained)
+
+
+def test_a_comparison_is_made_once_for_the_same_scene(scene, tmp_path: Path, monkeypatch) -> None:
+    waits: list[int] = []
+
+    def compare(of) -> Alignment:
+        settings = RasterSettings.recorded(of.identity)
+        return cached_alignment(of, settings, tmp_path, device="cpu", wait_for_kernels=lambda: waits.append(1))
+
+    match = compare(scene)
+    assert match == measure_alignment(scene) and len(waits) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(alignment, "measure_alignment", lambda *_, **__: pytest.fail("rendered again"))
+        assert compare(scene) == match and len(waits) == 1
+    for change in (noisy, focal(1.1)):
+        assert compare(Changed(scene, change)).psnr < match.psnr
+    count = len(waits)
+    for file in tmp_path.iterdir():
+        file.write_bytes(file.read_bytes()[:-1])
+    assert compare(scene) == match and len(waits) == count + 1
 
 
 def test_what_belongs_together_passes(scene, trained: Path) -> None:

@@ -290,3 +290,10 @@ def test_a_question_takes_the_tower_and_open_clip_where_there_is_none(clip, monk
     assert isinstance(made[0], open_clip_network.TextTower)
     monkeypatch.setattr(open_clip_network, "load_text_tower", lambda *a: None)
     assert (found - text_encoder_for(field, "cpu").text(["fox"])).abs().max() < 2e-6
+
+
+def test_weights_are_drawn_at_random_again_after_a_network_is_loaded(clip_weights) -> None:
+    functions = [getattr(torch.nn.init, name) for name in ("kaiming_uniform_", "normal_", "uniform_")]
+    assert OpenClipEncoder(CLIP, str(clip_weights / "tiny.pt")).network is not None
+    assert [getattr(torch.nn.init, name) for name in ("kaiming_uniform_", "normal_", "uniform_")] == functions
+    assert torch.nn.Linear(3, 4).weight.unique().numel() == 12
