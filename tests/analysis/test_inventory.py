@@ -41,12 +41,9 @@ def scene_of_blocks(*, seam: int, cosine: float, swap: bool = False) -> torch.Te
     return find_inventory(evidence, rows.repeat(VIEWS, 1), means, spread=0.2).view(SIDE, SIDE)
 
 
-@pytest.mark.parametrize(
-    ("seam", "cosine", "objects"),
-    [(0, 0.3, 2), (100, 0.3, 3), (100, 0.9, 2)],
-    ids=["random borders vanish", "borders that stay divide", "unless the features agree"],
-)
+@pytest.mark.parametrize(("seam", "cosine", "objects"), [(0, 0.3, 2), (100, 0.3, 3), (100, 0.9, 2)])
 def test_parts_are_divided_where_images_agree(seam: int, cosine: float, objects: int) -> None:
+    """Random borders vanish, borders that stay divide, unless the features agree."""
     found = scene_of_blocks(seam=seam, cosine=cosine)
     assert int(found.max()) == objects
     assert not set(found[: SIDE // 2].unique().tolist()) & set(found[SIDE // 2 :].unique().tolist())

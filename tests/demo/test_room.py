@@ -103,8 +103,13 @@ def test_held_out_views_see_all_classes_from_elsewhere(room: DemoRoom):
 LOW, HIGH = np.full(3, -1.0), np.full(3, 1.0)
 
 
-def solids() -> dict[str, tuple[shapes.Distance, float]]:
-    return {
+def sampled(shape: shapes.Distance, density: float) -> shapes.Array:
+    near = shapes.sample_near_surface(shape, LOW, HIGH, density, np.random.default_rng(0))
+    return shapes.project_to_surface(shape, near, LOW, HIGH)
+
+
+def test_surface_points_are_even_and_on_the_surface_and_normals_point_outward():
+    solids = {
         "sphere": (shapes.sphere(0.5), math.pi),
         "box": (shapes.box(1.0, 0.8, 0.6), 2 * (0.8 + 0.6 + 0.48)),
         "round": (shapes.box(1.0, 0.8, 0.6, 0.1), 2 * (0.48 + 0.32 + 0.24) + math.pi * (0.2 * 1.8 + 0.04)),
@@ -115,15 +120,7 @@ def solids() -> dict[str, tuple[shapes.Distance, float]]:
         "moved": (shapes.place(shapes.box(1.0, 0.8, 0.6), 0.1, -0.2, 0.05, 30), 2 * (0.8 + 0.6 + 0.48)),
         "apart": (shapes.union(shapes.sphere(0.25), shapes.place(shapes.sphere(0.25), 0.6, 0, 0)), math.pi / 2),
     }
-
-
-def sampled(shape: shapes.Distance, density: float) -> shapes.Array:
-    near = shapes.sample_near_surface(shape, LOW, HIGH, density, np.random.default_rng(0))
-    return shapes.project_to_surface(shape, near, LOW, HIGH)
-
-
-def test_surface_points_are_even_and_on_the_surface_and_normals_point_outward():
-    for name, (shape, area) in solids().items():
+    for name, (shape, area) in solids.items():
         points = sampled(shape, 5000)
         assert np.abs(shape(points)).max() < shapes.ON_SURFACE, name
         assert len(points) == pytest.approx(5000 * area, rel=0.05), name

@@ -70,13 +70,6 @@ def test_damaged_and_hostile_files_raise_our_errors_only(tmp_path: Path) -> None
         path.unlink()
 
 
-def changed(document: dict[str, Any], path: tuple[Any, ...], value: Any) -> str:
-    found = deepcopy(document)
-    *keys, last = path
-    reduce(getitem, keys, found)[last] = value
-    return json.dumps(found)
-
-
 def test_labels_of_lerf_say_what_is_wrong(tmp_path: Path) -> None:
     for path, value, message in (
         (("info", "width"), 0, r"`int` >= 1 - at `\$\.info\.width`"),
@@ -88,7 +81,9 @@ def test_labels_of_lerf_say_what_is_wrong(tmp_path: Path) -> None:
         (("objects", 0, "bbox"), [1, 2, 3], "length 4"),
         (("objects", 0, "bbox"), [0, 0, -1e12, 5], r"1e\+12"),
     ):
-        (tmp_path / "f.json").write_text(changed(FRAME, path, value))
+        *keys, last = path
+        reduce(getitem, keys, document := deepcopy(FRAME))[last] = value
+        (tmp_path / "f.json").write_text(json.dumps(document))
         with pytest.raises(InputError, match=rf"f\.json .*{message}"):
             read_frame(tmp_path / "f.json", 40, 30)
 
