@@ -25,9 +25,7 @@ def test_views_are_counted_by_their_angles():
                 total += float(row[v] * row[w]) * math.exp(-angle / 21.7)
         n_eff.append(float(row.sum() ** 2) / total if total > 0 else 0.0)
     torch.testing.assert_close(found, torch.tensor(n_eff, dtype=torch.float64), rtol=1e-6, atol=1e-9)
-
-
-def test_cameras_at_one_place_are_one_view_and_opposite_ones_are_two():
+    # Cameras at one place are one view, and opposite ones are two
     rows = SparseRows(torch.tensor([0, 2, 4]), torch.tensor([0, 1, 0, 2], dtype=torch.int32), torch.ones(4))
     centers = torch.tensor([[4.0, 0, 0], [4.0, 0, 0], [-4.0, 0, 0]])
     found = independent_views(rows, torch.zeros(2, 3, dtype=torch.float64), centers)

@@ -13,7 +13,7 @@ ROTATION = Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix()
 MATRIX = np.block([[2.5 * ROTATION, np.array([[1.0], [2.0], [3.0]])], [np.array([[0.0, 0, 0, 1]])]])
 
 
-def test_a_matrix_is_read_in_its_parts(tmp_path: Path) -> None:
+def test_a_matrix_is_read_in_its_parts_and_dataparser_transforms_from_the_capture(tmp_path: Path) -> None:
     (tmp_path / "world.json").write_text(json.dumps(MATRIX.tolist()))
     np.save(tmp_path / "world.npy", MATRIX)
     np.savetxt(tmp_path / "world.txt", MATRIX)
@@ -23,10 +23,7 @@ def test_a_matrix_is_read_in_its_parts(tmp_path: Path) -> None:
         assert world.scale == pytest.approx(2.5)
         assert np.allclose(world.scale * world.transform, MATRIX[:3]), path
         assert not world.float32
-
-
-def test_dataparser_transforms_start_from_the_capture(tmp_path: Path) -> None:
-    """p = scale (T A^-1) p_file, with A the turn that ns-process-data applied."""
+    # Of nerfstudio: p = scale (T A^-1) p_file, with A the turn that ns-process-data applied
     applied = np.eye(4)
     applied[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     transform = np.column_stack([ROTATION, [1.0, 2.0, 3.0]])

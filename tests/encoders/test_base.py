@@ -35,9 +35,7 @@ def test_view_features_accept_what_fits_and_refuse_the_rest():
         ((labels, UNIT[:, :0]), None, "vectors of a"), ((labels, UNIT), {"\ud800": UNIT[0]}, "not a valid prompt"),
     ):  # fmt: skip
         refused(lambda given=(pair, texts): precomputed_features([given[0]], given[1], ["a"]), name)
-
-
-def test_regions_of_cells_must_have_features():
+    # Regions of cells must have features
     labels = torch.tensor([[-1, 0], [1, 2]], dtype=torch.int32)
     view = ViewFeatures(labels, UNIT, torch.tensor([[1, -1, 0], [-1, -1, 1]], dtype=torch.int32))
     assert torch.equal(view.region_of_cell, view.regions)

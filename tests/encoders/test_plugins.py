@@ -113,6 +113,7 @@ def test_what_another_package_makes_is_checked(tmp_path: Path) -> None:
         ("torch.ones(2, 3)", "Wrong()", ["1.73"]),
         ("torch.eye(3)", "Wrong()", ["torch.float32 (3, 3)", "per region", "[2, D]"]),
         ("None", "Wrong()", ["NoneType", "per region"]),
+        ("torch.eye(2) / torch.zeros(1)", "Wrong()", ["expected 1"]),
         ("1 / 0", "Wrong()", ["'wrong'", "ZeroDivisionError"]),
         ("0", "object()", ["identity", "encode", "text"]),
         ("0", "missing", ["'wrong'", "NameError"]),
