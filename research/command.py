@@ -318,7 +318,7 @@ def joined(report: Report, file: Path) -> Report:
 
 
 def main(trained: Path, quick: bool, before: Path | None, kinds: Sequence[str], output: Path) -> None:
-    report = Report("command")
+    report = Report("lifts" if len(kinds) > 0 else "command")
     with tempfile.TemporaryDirectory() as name:
         if before is not None and len(kinds) > 0:
             add_lifts_in_turns(report, trained.absolute(), before.absolute(), Path(name), kinds)
@@ -328,7 +328,7 @@ def main(trained: Path, quick: bool, before: Path | None, kinds: Sequence[str], 
             add_lifts(report, trained.absolute(), Path(name), 2 if quick else 3)
         else:
             add_questions(report, trained.absolute(), Path(name), 3 if quick else 5)
-    joined(report, output / "command.json").write(output)
+    joined(report, output / f"{report.name}.json").write(output)
 
 
 if __name__ == "__main__":

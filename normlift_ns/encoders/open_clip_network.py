@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Float, Float32, Int64
 from safetensors import safe_open
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import gelu, interpolate, layer_norm, linear, normalize, scaled_dot_product_attention
+from torch.overrides import TorchFunctionMode
 
 from normlift_ns.core.device import shared_property
 from normlift_ns.encoders.crops import NetworkEncoder
@@ -32,8 +31,6 @@ from normlift_ns.encoders.weights import CONNECT_ONCE, third_party_errors
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.io.guard import check_regular
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, CropFill
-
-_init_lock = Lock()
 
 
 class OpenClipNetwork(NamedTuple):
@@ -69,19 +66,13 @@ class OpenClipNetwork(NamedTuple):
         return self.model.encode_text(self.tokenizer(list(texts)).to(self.mean.device))
 
 
-@contextmanager
-def _uninitialized() -> Iterator[None]:
-    """Leave weights without the random values of `torch.nn.init`, which take seconds, until a file replaces them."""
-    names = ("kaiming_uniform_", "normal_", "uniform_")
-    with _init_lock:
-        kept = {name: getattr(nn.init, name) for name in names}
-        try:
-            for name in names:
-                setattr(nn.init, name, lambda tensor, *_, **__: tensor)
-            yield
-        finally:
-            for name, function in kept.items():
-                setattr(nn.init, name, function)
+class _Uninitialized(TorchFunctionMode):
+    """A context that skips the random initialization of modules in this thread, for weights that a file replaces."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if getattr(func, "__module__", None) == "torch.nn.init":
+            return args[0] if len(args) > 0 else kwargs["tensor"]
+        return func(*args, **(kwargs or {}))
 
 
 def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
@@ -95,7 +86,7 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
     open_clip = import_open_clip()
     path, training = find_open_clip_weights(model, pretrained)
     with (
-        _uninitialized(),
+        _Uninitialized(),
         third_party_errors(
             f"OpenCLIP model {model} cannot be built with the packages installed here",
             f"choose another model with --encoder-model, such as {DEFAULT_MODEL}",
