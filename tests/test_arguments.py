@@ -294,6 +294,7 @@ def test_the_table_has_every_public_name():
     named = {getattr(function, "__name__", "") for function, *_ in TABLE}
     rest = {name for name in nl.__all__ if callable(getattr(nl, name))} - made - {"Scene", "InputError"}
     assert rest - named - {"SemanticField"} == set()
+    assert set(nl.__all__) <= set(dir(nl))
     with pytest.raises(AttributeError, match="nothing"):
         _ = nl.nothing
     assert all(is_dataclass(getattr(nl, name)) or name == "Consensus" for name in made)
