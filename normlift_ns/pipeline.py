@@ -97,6 +97,8 @@ _OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
 """Kinds of regions that are objects or parts of objects."""
 _COMPARED = 20_000
 """Approximate number of Gaussians whose directions are compared before and after the vote."""
+_ALIGNMENT_FOLDER = "alignment"
+"""Folder of the cache with comparisons of renders and images."""
 _WARM_UP_GAUSSIANS, _WARM_UP_REGIONS = 4096, 4
 
 
@@ -241,7 +243,9 @@ def run_lift(request: LiftRequest) -> LiftedRun:
     load_networks(prepared.source, cache)
     collection = plan_collection(scene, prepared.source, prepared.lift, cache, device=device, export=request.export)
     kernels = start_kernel_warm_up(scene, collection.gaussians, collection.options, collection.config)
-    check_alignment(prepared, stages, kernels)  # while the other kernels are compiled
+    if not (cache / _ALIGNMENT_FOLDER).exists():  # a lift with cached evidence does not need these kernels
+        kernels.start_rasterization()
+    check_alignment(prepared, stages, kernels.wait_for_rendering)  # while the other kernels are compiled
     result = lift_collection(collection, kernels, device=device, encoder=prepared.encoder, report=request.report)
     return write_lifted_run(prepared, result, stages)
 
@@ -336,21 +340,21 @@ def compare_with_images(
     return alignment_warning(match, trained_cameras=not isinstance(scene, SplatScene))
 
 
-def check_alignment(prepared: PreparedLift, stages: StageTimer, kernels: KernelWarmUp) -> None:
+def check_alignment(prepared: PreparedLift, stages: StageTimer, wait_for_rendering: Callable[[], None]) -> None:
     """Report the warning of `compare_with_images`, unless the request disables the comparison.
 
-    Start to compile the kernels of rasterization, unless the result is cached.
+    Args:
+        wait_for_rendering: Function that waits until the kernels for renders are compiled.
     """
     if not prepared.request.check_alignment:
-        kernels.start_rasterization()
         return
     with stages("check") as step:
         measure = measure_alignment
         if prepared.lift.reuse_evidence:
-            folder = cache_folder(prepared.run_dir) / "alignment"
-            measure = partial(cached_alignment, folder=folder, wait_for_kernels=kernels.wait_for_rendering)
+            folder = cache_folder(prepared.run_dir) / _ALIGNMENT_FOLDER
+            measure = partial(cached_alignment, folder=folder, wait_for_kernels=wait_for_rendering)
         else:
-            kernels.wait_for_rendering()
+            wait_for_rendering()
         warning = compare_with_images(prepared.scene, prepared.lift, prepared.device, measure)
         step()
     if warning is not None:
@@ -861,10 +865,7 @@ class KernelWarmUp:
             self._lift = [self._start(call) for call in self._lift_calls(dimension)]
 
     def start_rasterization(self) -> None:
-        """Start to compile the kernels of renders and evidence, unless this has been done.
-
-        A lift with cached evidence does not need them.
-        """
+        """Start to compile the kernels of renders and evidence, unless this has been done."""
         if len(self._rendering) == 0:
             self._rendering, self._sums = (
                 [self._start(call) for call in calls] for calls in (self._rendering_calls, self._sums_calls)

@@ -52,7 +52,7 @@ def run_lift_distributed(team: TorchCommunicator, request: pipeline.LiftRequest)
     pipeline.announce(prepared)
     pipeline.load_networks(prepared.source, cache_folder(run_dir))
     if team.rank == 0:
-        pipeline.check_alignment(prepared, before, pipeline.KernelWarmUp())
+        pipeline.check_alignment(prepared, before, lambda: None)
     cache, device = cache_folder(run_dir), prepared.device
     collection = pipeline.plan_collection(
         prepared.scene, prepared.source, prepared.lift, cache, device=device, export=request.export
