@@ -350,7 +350,7 @@ def check_alignment(prepared: PreparedLift, stages: StageTimer, wait_for_renderi
         return
     with stages("check") as step:
         measure = measure_alignment
-        if prepared.lift.reuse_evidence:
+        if prepared.lift.reuse_evidence and prepared.request.features is None:  # given features may still be refused
             folder = cache_folder(prepared.run_dir) / _ALIGNMENT_FOLDER
             measure = partial(cached_alignment, folder=folder, wait_for_kernels=wait_for_rendering)
         else:

@@ -226,7 +226,7 @@ def test_cameras_that_changed_after_the_lift_are_warned_of(lifted: Path, tmp_pat
         else:
             frames[1]["transform_matrix"][0][3] += 4e-4
         file.write_text(json.dumps(content))
-        with pytest.warns(UserWarning, match=f"the {changed} cameras"):
+        with pytest.warns(UserWarning, match=f"The {changed} cameras"):
             nl.open_run(lifted, data=room)
 
 

@@ -56,6 +56,8 @@ def train(workspace: Path, methods: dict[str, Any], monkeypatch: pytest.MonkeyPa
 
 
 def test_the_run_is_lifted_in_place(train: Any, workspace: Path, registered: None, capsys) -> None:
+    from normlift_ns.nerfstudio_plugin.pipeline import TrainingCallbackAttributes  # noqa: PLC0415
+
     turned, exif = workspace / "scene" / "images" / "002.jpg", Image.Exif()
     exif[0x0112] = 6
     Image.open(turned).save(turned, exif=exif)
@@ -81,6 +83,8 @@ def test_the_run_is_lifted_in_place(train: Any, workspace: Path, registered: Non
     assert (stored.lift, stored.source.encoder) == (LIFT, "color")
     assert (again.lift, again.queries) == (LIFT, ("red", "sky blue"))
     assert not any("normlift" in name for name in trained.pipeline.state_dict())
+    attributes = dict.fromkeys(("optimizers", "grad_scaler", "pipeline", "trainer"))
+    assert len(trained.pipeline.get_training_callbacks(TrainingCallbackAttributes(**attributes))) == 2
     assert model.field is model.config.semantics is None  # a training that goes on changes the Gaussians
 
 
