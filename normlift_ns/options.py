@@ -594,9 +594,9 @@ class SplatOptions:
     x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY file. None: no search, and no
     transform except that of --gsplat-normalize."""
     gsplat_normalize: bool = True
-    """For a splat from gsplat's trainer: assume that the trainer normalized the world, and recompute the normalization
-    from the COLMAP project. The setting in the trainer's cfg.yml takes precedence. For other splats, --world-transform
-    auto also tries this normalization."""
+    """For a splat from gsplat's trainer: assume that the trainer normalized the world, unless its cfg.yml records that
+    it did not, and recompute the normalization from the COLMAP project. False: assume no normalization, whatever
+    cfg.yml records. For other splats, --world-transform auto also tries this normalization."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None

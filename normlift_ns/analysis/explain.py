@@ -340,7 +340,7 @@ class RecordedVotes:
         missing = [name for name in names if name not in set(self.scene.train.names)]
         if len(missing) > 0:
             raise InputError(
-                f"the dataset no longer has {len(missing)} of {len(names)} images of the lift, such as {missing[0]}. "
+                f"the dataset no longer has {len(missing)} of {len(names)} images of the lift (first: {missing[0]}). "
                 "Restore the images, give the path of the dataset with --data, or lift again with: ns-normlift"
             )
         store = self.field.store

@@ -78,8 +78,8 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
         raise InputError(f"Invalid options after --. {error}") from None
     if (name := next((name for name in _SOURCE_NAMES if getattr(common, name) is not None), None)) is not None:
         raise InputError(
-            f"--{name.replace('_', '-')} is given after --, but options there apply to every capture. Write it into "
-            f"{path}, with one line per capture."
+            f"--{name.replace('_', '-')} is given after --, but options there apply to every capture. Write this "
+            f"option into {path}, with one line per capture."
         )
     try:
         text = read_text(path, "utf-8-sig")

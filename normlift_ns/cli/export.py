@@ -41,9 +41,9 @@ class NormLiftExport(options.CheckedOptions):
     """Prompts to search for. Commas and semicolons separate prompts, except between double quotes. Without prompts, the
     command uses the queries stored in the run, if there are any, with their options."""
     select: Literal["scene", "selection", "rest", "clean"] = "scene"
-    """Gaussians to export. scene: all Gaussians. selection: Gaussians that any prompt selects. rest: Gaussians that no
-    prompt selects. clean: all except likely floaters, which float in front of the cameras instead of belonging to a
-    surface."""
+    """Gaussians to export. scene: all. selection: those that any prompt selects. rest: those that no prompt selects.
+    clean: all except likely floaters, which float in front of the cameras instead of belonging to a surface. Exports
+    always leave out invisible Gaussians, whose opacity is below 1/255 or whose parameters are not finite."""
     ask: options.AskOptions = field(default_factory=options.AskOptions)
     output_filename: str = "splat.ply"
     """Name of the splat file. Its ending selects the format: .ply, .compressed.ply, .glb or .spz. The command also

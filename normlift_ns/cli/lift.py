@@ -75,8 +75,9 @@ class NormLift(CheckedOptions):
     """Splat file to use instead of --load-config: PLY, compressed PLY, SPZ, .splat, GLB or glTF. Needs --colmap or
     --transforms."""
     load_gsplat: Path | None = None
-    """Checkpoint ckpt_<step>_rank0.pt of gsplat's simple_trainer, to use instead of --load-config. Needs --colmap, or
-    --transforms with --gsplat-normalize False or a file in --world-transform."""
+    """Checkpoint ckpt_<step>_rank0.pt of gsplat's simple_trainer, to use instead of --load-config. Needs --colmap
+    or --transforms. If the trainer normalized the world, --transforms also needs --world-transform FILE. If it did not,
+    add --gsplat-normalize False, unless its cfg.yml records that."""
     splat: SplatOptions = field(default_factory=SplatOptions)
     add_images: Path | None = None
     """COLMAP project folder or transforms.json with images taken after training, which the lift then uses too. It must

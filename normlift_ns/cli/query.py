@@ -38,6 +38,7 @@ from normlift_ns.options import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.table import Table
 
     from normlift_ns.analysis.explain import RecordedVotes, ViewVote, Why
@@ -77,8 +78,9 @@ class NormLiftQuery(CheckedOptions):
     history: bool = True
     """Keep a history of --interactive prompts in a file that only you can read."""
     coordinates: Literal["scene", "capture"] = "scene"
-    """Coordinate system of all positions in tables and --output-json. scene: that of the Gaussians and of viewers.
-    capture: that of the original cameras, before the training rotated and scaled them."""
+    """Coordinate system of the positions in tables and --output-json. scene: that of the Gaussians and of viewers.
+    capture: that of the original cameras, before the training rotated and scaled them. The JSON file of
+    --inventory has both. --meters-per-unit sets the table of objects to capture."""
     save_query: bool = False
     """Store the queries in the run in place of earlier ones. ns-render and ns-viewer then show their relevancy."""
     output_json: Path | None = None
@@ -109,8 +111,8 @@ class NormLiftQuery(CheckedOptions):
     box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z. Both span the
     1st to 99th percentile. R is the mean reliability. views counts the training images that show the object with at
     least a tenth of its largest visible area. best views has up to three of them. Images of the whole object come
-    first. Among these and among the others, images that show the object larger come first. If there are more than 40
-    objects, the table lists only the 10 largest, and a line below counts the objects of each prompt."""
+    first; within both groups, images in which the object appears larger come first. If there are more than 40 objects,
+    the table lists only the 10 largest, and a line below counts the objects of each prompt."""
     objects_dir: Path | None = None
     """Folder for the list of --objects or --inventory in capture and scene coordinates, with the axes of the boxes. The
     files are objects.json and objects.csv, and objects.ply and objects_scene.ply with the meshes of the boxes.
@@ -160,7 +162,9 @@ class NormLiftQuery(CheckedOptions):
         save_renders = self._prepare_renders(result.question) if self.render_dir is not None else None
         rows = result.to_json()
         show_why = self._explain(result, rows) if self.explain else None
-        sam3_arrays, show_sam3 = self._segment(result, rows) if self.segment is not None else ({}, None)
+        sam3_arrays, show_sam3 = (
+            self._segment(result, rows, run.field.arrays["means"]) if self.segment is not None else ({}, None)
+        )
         show_objects = self._list_objects(result.question) if self.objects else None
         if self.output_json is not None:
             question = result.question
@@ -251,9 +255,13 @@ class NormLiftQuery(CheckedOptions):
             save_vote_images(votes, result.question.texts, reasons, self.explain_dir, overwrite=self.overwrite)
         return lambda: print_explanations(votes.names, result.question.texts, reasons, self.explain_dir)
 
-    def _segment(self, result: Answer, rows: list[dict[str, Any]]) -> tuple[dict[str, Any], Callable[[], None]]:
+    def _segment(
+        self, result: Answer, rows: list[dict[str, Any]], means: np.ndarray
+    ) -> tuple[dict[str, Any], Callable[[], None]]:
         """Segment training views with SAM 3 for the same prompts, lift the masks, and add their summary to every row.
 
+        Args:
+            means: Centers of the Gaussians for the summary, [N, 3].
         Returns:
             The arrays of the lifted masks, and a function that prints the summaries.
         """
@@ -280,7 +288,7 @@ class NormLiftQuery(CheckedOptions):
             settings=RasterSettings.recorded(run.field.manifest),
             device=device,
         )
-        summaries = segmented.summarize(run.scene.gaussians.means, torch.as_tensor(result.selected))
+        summaries = segmented.summarize(torch.from_numpy(means), torch.as_tensor(result.selected))
         for row, summary in zip(rows, summaries):
             row["segment"] = {"model": model, **summary}
         columns = {

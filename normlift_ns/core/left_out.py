@@ -42,8 +42,8 @@ class LeftOut(NamedTuple):
     confirmed: int
     """Number of left-out regions that overlapping kept regions confirm."""
     agreement: float
-    """Mean cosine between the feature of a left-out region in the kept views and its own feature after a consensus
-    among the left-out views; NaN without regions."""
+    """Mean cosine, over the left-out regions, between two features: the one that the lift of the kept views gives the
+    region, and its own after a consensus among the left-out views. NaN without regions."""
 
     @property
     def facts(self) -> dict[str, Any]:

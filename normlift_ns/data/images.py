@@ -95,8 +95,8 @@ def _matching(requested: str, names: Sequence[str]) -> list[str]:
     matches = [name for name in names if path.as_posix().endswith(f"/{name}")]
     if len(matches) != 1:
         raise InputError(
-            f"--eval-images {requested} does not match exactly one of the {len(names)} images. Give the name of an "
-            f"image, from {names[0]} to {names[-1]}."
+            f"--eval-images {requested} matches {len(matches) or 'none'} of the {len(names)} images, expected one. "
+            f"Give the name of an image, from {names[0]} to {names[-1]}."
         )
     return matches
 
