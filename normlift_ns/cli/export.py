@@ -47,8 +47,8 @@ class NormLiftExport(options.CheckedOptions):
     ask: options.AskOptions = field(default_factory=options.AskOptions)
     output_filename: str = "splat.ply"
     """Name of the splat file. Its ending selects the format: .ply, .compressed.ply, .glb or .spz. The command also
-    writes <name>_rows.npy, the index of each Gaussian in the run. With prompts, it also writes <name>_names.json (names
-    of class_id and instance_id) and <name>_objects.json (objects)."""
+    writes <name>_rows.npy, the index in the run of each exported Gaussian. With prompts, given or stored, it also
+    writes <name>_names.json (names of class_id and instance_id) and <name>_objects.json (objects)."""
     coordinates: Literal["scene", "capture"] = "scene"
     """Coordinate system of the exported Gaussians and objects. scene: that of the trained Gaussians and of viewers.
     capture: that of the original cameras, before the training rotated and scaled them."""
@@ -63,7 +63,8 @@ class NormLiftExport(options.CheckedOptions):
     Each exporter writes <name>_<exporter> with its own suffix to the output folder."""
     transfer: Path | None = None
     """PLY point cloud or mesh to label. The command writes a copy, <name of the cloud>_labels.ply, with the class_id,
-    instance_id and relevancies of the nearest visible Gaussian. They are 0 if no Gaussian is near enough."""
+    instance_id and relevancies of the nearest visible Gaussian. They are 0 if no Gaussian is within
+    --transfer-distance."""
     transfer_distance: float = options.MAX_TRANSFER_DISTANCE
     """Maximum distance from a point to the center of its Gaussian for --transfer, > 0. Larger values label more points.
     The unit is the median distance from a Gaussian to the nearest one at another position."""
@@ -82,7 +83,7 @@ class NormLiftExport(options.CheckedOptions):
     data: Path | None = None
     """Current path of the dataset, if it was moved."""
     device: str = "auto"
-    """Device for the text encoder: auto, cpu or cuda."""
+    """Device for the text encoder: auto, cpu, cuda, or one GPU such as cuda:1."""
 
     def main(self) -> Path:
         """Write the files and return the path of the splat file."""

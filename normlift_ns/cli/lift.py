@@ -96,9 +96,10 @@ class NormLift(CheckedOptions):
     timestamp: str | None = None
     """Name of the new run directory. None: the current time."""
     overwrite: bool = False
-    """Replace an existing run directory that has the same --timestamp, and exported files whose content differs."""
+    """Replace an existing run directory that has the same --timestamp, and files in --export-langsplat whose content
+    differs."""
     device: str = "auto"
-    """Device to lift on: auto, cpu or cuda."""
+    """Device to lift on: auto, cpu, cuda, or one GPU such as cuda:1."""
     num_devices: int = 1
     """Number of processes on this machine, each with its own GPU or an equal share of the CPU cores. For several
     machines, use torchrun."""

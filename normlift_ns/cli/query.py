@@ -84,7 +84,8 @@ class NormLiftQuery(CheckedOptions):
     output_json: Path | None = None
     """JSON file for the table."""
     output_npz: Path | None = None
-    """NPZ file for relevancy [N, Q], reliability [N], valid [N] and names [Q], for N Gaussians and Q prompts."""
+    """NPZ file for relevancy [N, Q], reliability [N], valid [N] and names [Q], for N Gaussians and Q prompts. --segment
+    adds segment_relevancy, segment_reliability and segment_agreement, each [N, Q]."""
     render_dir: Path | None = None
     """Folder for renders of the relevancy."""
     render_views: tuple[str, ...] = ()
@@ -101,7 +102,7 @@ class NormLiftQuery(CheckedOptions):
     segment_model: str | None = None
     """Weights of SAM 3: a folder in transformers format, or a model name to download. None: facebook/sam3."""
     segment_views: int = 8
-    """Maximum number of evenly spaced training views for --segment, at least 1. More views are slower and more
+    """Maximum number of training views for --segment, evenly spaced, at least 1. More views are slower and more
     reliable."""
     objects: bool = False
     """List the objects in the selection, which are connected groups of at least 20 Gaussians. The column id is the
@@ -124,7 +125,7 @@ class NormLiftQuery(CheckedOptions):
     vocabulary: Path | None = None
     """Text file with names of objects for --inventory, one per line. None: the texts of the run's file of text
     embeddings, or else the words of the encoder: 1,000 classes for imagenet, and the names of colors for color. Other
-    encoders have no words, so objects are only numbered."""
+    built-in encoders have no words, so objects are only numbered."""
     image: Path | None = None
     """PNG file for --inventory: a render with the outlines, numbers and names of the objects. The camera is that of the
     training image that shows the most objects."""
@@ -133,7 +134,7 @@ class NormLiftQuery(CheckedOptions):
     data: Path | None = None
     """Current path of the dataset, if it was moved."""
     device: str = "auto"
-    """Device for the text encoder and the renders: auto, cpu or cuda."""
+    """Device for the text encoder and the renders: auto, cpu, cuda, or one GPU such as cuda:1."""
 
     def main(self) -> list[dict[str, Any]]:
         """Run the query, write files, print the table and return its rows; [] with --stdin or --interactive."""

@@ -33,12 +33,12 @@ class ServeOptions(CheckedOptions):
     port: int = 7008
     """Port to listen on, in 1..65535. If it is in use, the server takes the first free one of the next 99 ports."""
     read_only: bool = False
-    """Prevent visitors from storing prompts in the run."""
+    """Prevent visitors from storing prompts in a run."""
     max_gaussians: int = 1_000_000
     """Maximum number of Gaussians that a browser renders. Larger scenes show only their most opaque and largest
     Gaussians. Larger values need more browser memory."""
     device: str = "auto"
-    """Device for the text encoder: auto, cpu or cuda."""
+    """Device for the text encoder: auto, cpu, cuda, or one GPU such as cuda:1."""
 
     def check(self) -> None:
         """Raise InputError if the server cannot listen at the address, or an option is not valid."""
