@@ -712,7 +712,8 @@ class LiftOptions(CheckedOptions):
     """Images that the encoder receives. photos: the training images. render: renders of the trained scene from the same
     cameras."""
     max_views: int | None = None
-    """Maximum number of training views to lift, evenly spaced. More views are slower and more reliable. None: all."""
+    """Maximum number of training views to lift, evenly spaced. More views take longer and give more reliable results.
+    None: all."""
     lift_downscale: int = 1
     """Divisor of the width and height of images and cameras, at least 1. Larger values are faster and coarser."""
     reliability_beta: float = 1.0
@@ -728,8 +729,8 @@ class LiftOptions(CheckedOptions):
     weight_power: Literal[1, 2] = 1
     """Exponent of the rasterization weights A_ij: 1 as in the paper, or 2 for squared weights."""
     consensus: bool = True
-    """Before the lift, move the feature of each region toward those of regions in other views that cover the same
-    Gaussians."""
+    """Before the lift, move the features of regions toward those of regions in other views that cover the same
+    Gaussians. This requires enough agreement between the views; see --consensus-min-agreement."""
     consensus_power: float = 1.0
     """Exponent on the overlap fraction in the consensus, >= 0. Larger values down-weight regions that cover more than
     the target region. Needs --consensus True."""
@@ -750,7 +751,7 @@ class LiftOptions(CheckedOptions):
     wins the vote, or keeps its own."""
     vote: RefineConfig = field(default_factory=RefineConfig)
     tolerance: float = 1e-3
-    """Maximum error that --storage auto or low_rank may add to any cosine, > 0. Larger values give smaller files."""
+    """Maximum error that --storage auto or low_rank may add to any cosine, > 0. Larger values allow smaller files."""
     storage: Storage | Literal["auto"] = "auto"
     """Storage format of directions. evidence: the exact evidence. float16: half-precision vectors. low_rank:
     coordinates in a low-rank basis. auto: the smallest format within --tolerance."""

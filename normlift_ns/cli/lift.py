@@ -46,7 +46,7 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
     """Join the other processes of the lift. Only the first process prints.
 
     Args:
-        device: Device to lift on: cpu, cuda or auto.
+        device: Value of --device.
     Yields:
         The communicator, or None if there is only one process.
     """
@@ -319,7 +319,7 @@ def keep_freed_memory() -> None:
 
 @contextmanager
 def frequent_switches() -> Iterator[None]:
-    """Let threads take turns ten times as often, so that one that reads files does not wait for one that imports."""
+    """Switch between threads ten times as often, so that threads that read files do not wait for imports."""
     interval = sys.getswitchinterval()
     sys.setswitchinterval(interval / 10)
     try:

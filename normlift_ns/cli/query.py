@@ -102,8 +102,8 @@ class NormLiftQuery(CheckedOptions):
     segment_model: str | None = None
     """Weights of SAM 3: a folder in transformers format, or a model name to download. None: facebook/sam3."""
     segment_views: int = 8
-    """Maximum number of training views for --segment, evenly spaced, at least 1. More views are slower and more
-    reliable."""
+    """Maximum number of training views for --segment, evenly spaced, at least 1. More views take longer and give more
+    reliable results."""
     objects: bool = False
     """List the objects in the selection, which are connected groups of at least 20 Gaussians. The column id is the
     instance_id in exports, and text is the prompt of the object. centroid is the mean position, weighted by evidence.
@@ -198,7 +198,7 @@ class NormLiftQuery(CheckedOptions):
 
     @cached_property
     def _prompts(self) -> tuple[str, ...]:
-        """Prompts of --text, split at commas."""
+        """Prompts in the texts of --text; see `split_texts`."""
         from normlift_ns.query.question import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
 
         return split_texts("--text", self.text)
@@ -237,9 +237,9 @@ class NormLiftQuery(CheckedOptions):
         return lambda: save_overlays(scene, result, cameras, folder, **shared)
 
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
-        """Add an explanation to every row, write the images, and return a function that prints the explanations.
+        """Add explanations to the rows, write the images, and return a function that prints the explanations.
 
-        Prompts that select nothing have no explanation.
+        The explanation is None for a prompt that selects nothing.
         """
         import torch  # noqa: PLC0415
 
