@@ -760,8 +760,8 @@ class LiftOptions(CheckedOptions):
     throughout, which is slow on a GPU."""
     backend: BackendName = "auto"
     """Rasterization backend. triton: kernels of this package for a GPU. gsplat: kernels of gsplat for a GPU. numba:
-    compiled code for the CPU. torch: PyTorch code for any device, which is slow. auto: the fastest backend for the
-    device and the precision."""
+    compiled code for the CPU. torch: PyTorch code for any device, which is slow. auto: the fastest backend that
+    supports the device, the splat and the other options."""
     gsplat_version: GsplatVersion = "auto"
     """gsplat version whose rasterization rules the lift reproduces; it must be the version that trained the scene.
     installed: the version on this machine. auto: the version recorded with the scene, or else 1.4. Version 1.6 is not

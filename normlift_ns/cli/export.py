@@ -53,8 +53,8 @@ class NormLiftExport(options.CheckedOptions):
     """Coordinate system of the exported Gaussians and objects. scene: that of the trained Gaussians and of viewers.
     capture: that of the original cameras, before the training rotated and scaled them."""
     masks_dir: Path | None = None
-    """Folder for a PNG mask of each training image, with 255 for pixels of selected Gaussians, else 0. --select rest
-    swaps the values. The masks fit the undistorted images that the scene was trained with."""
+    """Folder for a PNG mask of each training image, with 255 for pixels that mostly show selected Gaussians, else 0.
+    --select rest swaps the values. The masks fit the undistorted images that the scene was trained with."""
     arrays_dir: Path | None = None
     """Folder for the exported Gaussians as arrays: coord.npy, segment.npy, instance.npy and names.json. Classes and
     objects are numbered from 0; -1 marks Gaussians without a class or an object."""
@@ -72,8 +72,8 @@ class NormLiftExport(options.CheckedOptions):
     """Coordinate system of the cloud for --transfer. capture: that of the original cameras, before the training rotated
     and scaled them. scene: that of the trained Gaussians."""
     object_max_gap: float = options.OBJECT_MAX_GAP
-    """Maximum gap between Gaussians of one object, > 0, in units of the selection's median spacing. Larger values merge
-    more objects."""
+    """Maximum gap between Gaussians of one object, > 0, in units of the median spacing of the Gaussians that its prompt
+    selects. Larger values merge more objects."""
     object_min_gaussians: int = options.OBJECT_MIN_GAUSSIANS
     """Minimum number of Gaussians in an object, at least 1. Larger values list fewer objects."""
     floater_threshold: float = options.FLOATER_THRESHOLD
