@@ -520,7 +520,7 @@ class NormLiftBatch(CheckedOptions):
     """Text file with one capture per line: the path of a config.yml, a splat file or a gsplat checkpoint. Options of
     ns-normlift for this capture may follow or replace the path."""
     options: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[-- OPTIONS, at the end]")] = ()
-    """Options of ns-normlift that apply to all captures, given after --."""
+    """Options of ns-normlift for all captures, given after --. Options in a line of the list take precedence."""
     results: Path | None = None
     """Folder for results, logs and claims, which all workers share. None: a folder next to the list, such
     as captures_batch for captures.txt."""

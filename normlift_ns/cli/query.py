@@ -86,7 +86,8 @@ class NormLiftQuery(CheckedOptions):
     output_json: Path | None = None
     """JSON file for the table."""
     output_npz: Path | None = None
-    """NPZ file for relevancy [N, Q], reliability [N], valid [N] and names [Q], for N Gaussians and Q prompts."""
+    """NPZ file for relevancy [N, Q], reliability [N], valid [N] and names [Q], for N Gaussians and Q prompts. --segment
+    adds segment_relevancy, segment_reliability and segment_agreement, each [N, Q]."""
     render_dir: Path | None = None
     """Folder for renders of the relevancy."""
     render_views: tuple[str, ...] = ()
@@ -103,8 +104,8 @@ class NormLiftQuery(CheckedOptions):
     segment_model: str | None = None
     """Weights of SAM 3: a folder in transformers format, or a model name to download. None: facebook/sam3."""
     segment_views: int = 8
-    """Maximum number of evenly spaced training views for --segment, at least 1. More views are slower and more
-    reliable."""
+    """Maximum number of training views for --segment, evenly spaced, at least 1. More views take longer and give more
+    reliable results."""
     objects: bool = False
     """List the objects in the selection, which are connected groups of at least 20 Gaussians. The column id is the
     instance_id in exports, and text is the prompt of the object. centroid is the mean position, weighted by evidence.
@@ -126,7 +127,7 @@ class NormLiftQuery(CheckedOptions):
     vocabulary: Path | None = None
     """Text file with names of objects for --inventory, one per line. None: the texts of the run's file of text
     embeddings, or else the words of the encoder: 1,000 classes for imagenet, and the names of colors for color. Other
-    encoders have no words, so objects are only numbered."""
+    built-in encoders have no words, so objects are only numbered."""
     image: Path | None = None
     """PNG file for --inventory: a render with the outlines, numbers and names of the objects. The camera is that of the
     training image that shows the most objects."""
@@ -135,7 +136,7 @@ class NormLiftQuery(CheckedOptions):
     data: Path | None = None
     """Current path of the dataset, if it was moved."""
     device: str = "auto"
-    """Device for the text encoder and the renders: auto, cpu or cuda."""
+    """Device for the text encoder and the renders: auto, cpu, cuda, or one GPU such as cuda:1."""
 
     def main(self) -> list[dict[str, Any]]:
         """Run the query, write files, print the table and return its rows; [] with --stdin or --interactive."""
@@ -201,7 +202,7 @@ class NormLiftQuery(CheckedOptions):
 
     @cached_property
     def _prompts(self) -> tuple[str, ...]:
-        """Prompts of --text, split at commas."""
+        """Prompts in the texts of --text; see `split_texts`."""
         from normlift_ns.query.question import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
 
         return split_texts("--text", self.text)
@@ -240,9 +241,9 @@ class NormLiftQuery(CheckedOptions):
         return lambda: save_overlays(scene, result, cameras, folder, **shared)
 
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
-        """Add an explanation to every row, write the images, and return a function that prints the explanations.
+        """Add explanations to the rows, write the images, and return a function that prints the explanations.
 
-        Prompts that select nothing have no explanation.
+        The explanation is None for a prompt that selects nothing.
         """
         import torch  # noqa: PLC0415
 

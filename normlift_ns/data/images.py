@@ -298,8 +298,8 @@ class SplitViews:
 class ImageViews(SplitViews):
     """Lazy `Views` of the images in a camera file; each access reads and undistorts one image.
 
-    Images of perspective cameras are undistorted as in nerfstudio's FullImageDatamanager, so stock commands use the
-    same images. The camera matrix becomes OpenCV's optimal one without black borders, and images are cropped to its
+    Images of perspective cameras are undistorted as in nerfstudio's FullImageDatamanager, so nerfstudio's commands use
+    the same images. The camera matrix becomes OpenCV's optimal one without black borders, and images are cropped to its
     region of interest. Images of fisheye cameras keep their size, and at least 90 % of their pixels if a pinhole camera
     can show these (see `fisheye_pinhole`). Their masks are undistorted without interpolation, and are False at pixels
     that the original image does not show.

@@ -70,7 +70,7 @@ def encode_spz(
     Args:
         splat: Gaussians to encode.
         antialiased: True if they were trained with the rasterize mode "antialiased".
-        version: Version of the format. More programs read version 3; version 4 is newer.
+        version: Version of the format. More programs read version 3 than version 4.
         position_step: Round positions to larger steps of up to this length, which makes the file smaller.
     Raises:
         ValueError: A Gaussian that can be drawn is farther than 8,388,607 from the origin along an axis.

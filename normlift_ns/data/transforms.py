@@ -648,7 +648,8 @@ def gsplat_normalization(frames: Sequence[Frame], points: Float[np.ndarray, "n 3
 
     The steps are those of gsplat 1.5, datasets/normalize.py and datasets/colmap.py. The first step makes the cameras
     upright, and places them around the origin at a median distance of 1. The second step rotates the principal axes of
-    the points to x, y and z, and turns the half with more points to the bottom.
+    the points to x, y and z, and turns the scene upside down if the median height of the points exceeds their mean
+    height.
 
     Args:
         frames: All registered images, sorted by name.
