@@ -64,7 +64,7 @@ class Rate:
     """Number of items in the whole lift."""
 
     def cost(self, share: float = 1.0) -> float:
-        """Return the cost of a share of the items.
+        """Return the fixed part plus the cost of a share of the items.
 
         >>> Rate(fixed=2.0, per_item=0.5, count=10).cost(0.5)
         4.5

@@ -357,8 +357,8 @@ def best_words(
     """Return the index of the best name of every object; None if the best name does not stand out from other words.
 
     Some words are similar to everything. The cosines of each word are therefore standardized over the scene, and then
-    those of each object over the words that are not names. The score of the best name must exceed a limit. If the
-    scores of 20 objects were normally distributed, `by_chance` pairs of an object and a name would exceed this limit.
+    those of each object over the words that are not names. The score of the best name must exceed a limit. For normally
+    distributed scores of 20 objects, the expected number of pairs (object, name) above this limit is `by_chance`.
     If all words are names, the scores are standardized over all words, and the best name must also have the best score.
 
     Args:

@@ -29,7 +29,7 @@ Record = TypeVar("Record")
 
 
 class shared_property(cached_property[Result]):
-    """A `cached_property` that threads may request at the same time; the others wait for the first."""
+    """A `cached_property` for use by several threads. One thread computes the value, and the others wait for it."""
 
     def __init__(self, function: Callable[[Any], Result]) -> None:
         super().__init__(function)

@@ -162,7 +162,7 @@ class Evidence(TensorRecord):
 
     @check_arguments
     def columns_of(self, views: Sequence[int] | Int[Tensor, " m"]) -> Int64[Tensor, " columns"]:
-        """Return the columns of the given views, in their order.
+        """Return the columns of the given views, in the order of `views`.
 
         `features[evidence.columns_of(v)]` is the feature table of `evidence.select_views(v)`.
 

@@ -265,7 +265,7 @@ class Finding:
     def verdict(self) -> Verdict | None:
         """Presence of the prompt in the scene; None as in `query.threshold.judge`, or if no Gaussian has a direction.
 
-        For a prompt that selects Gaussians, a weak match replaces "probably not here".
+        For a prompt that selects Gaussians, "weak match" replaces "probably not here".
         """
         verdict = self.answer.verdicts[self.index]
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
@@ -298,7 +298,7 @@ class Finding:
 
     @property
     def objects(self) -> list[SceneObject]:
-        """Objects of the selection, its connected components of at least 20 Gaussians, by descending size."""
+        """Objects of the selection, by descending size: its connected components of at least 20 Gaussians."""
         from normlift_ns.analysis.objects import find_objects  # noqa: PLC0415 (needs torch)
 
         return find_objects(self.answer.field, self.answer.means, self.mask).objects

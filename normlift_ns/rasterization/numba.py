@@ -104,7 +104,7 @@ def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) ->
 
 
 _STRETCH = 0.1
-"""Fraction by which a covariance is enlarged, because a bounding ellipse has another center than the bounded one."""
+"""Fraction by which a covariance is enlarged, because the bounding and the projected ellipse have different centers."""
 
 
 def _bounding_ellipses(projected: ProjectedGaussians2D, min_alpha: float) -> Float[Tensor, "m 3"]:

@@ -1,4 +1,4 @@
-"""Rasterization of evidence and images: backends and the choice of one, and compositing weights along a ray."""
+"""Rasterization of evidence and images, selection of backends, and compositing weights along a ray."""
 
 from __future__ import annotations
 
@@ -385,7 +385,9 @@ def render_with_image(
     mode: RasterizeMode | None = None,
     gaussians: GaussianScene | None = None,
 ) -> tuple[UInt8[Tensor, "h w 3"], Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """Return the results of `render_image`, on the CPU, and of `render`, in one pass over the Gaussians.
+    """Return the results of `render_image`, on the CPU, and of `render`.
+
+    Both are computed in one pass over the Gaussians, unless the scene has its own renderer.
 
     Args:
         values: Values per Gaussian, as in `render`, on the rendering device.
@@ -588,9 +590,9 @@ def view_colors(
 
 
 def rotate_harmonics(coefficients: Float[Tensor, "n k 3"], rotation: Float64[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
-    """Return the spherical harmonics of colors that rotate with their Gaussians.
+    """Return the coefficients of the spherical harmonics after a rotation of the Gaussians and their colors.
 
-    Harmonics in many directions before and after the rotation determine its matrix by least squares.
+    The matrix that rotates coefficients is computed by least squares from harmonics in many directions.
 
     Args:
         coefficients: Coefficients of the spherical harmonics without the constant term, in gsplat's order.

@@ -579,8 +579,9 @@ def save_inventory(
 ) -> str:
     """Write a PNG render of the scene with outlines, numbers and names of the objects of an inventory.
 
-    The camera is that of the training image that shows the most objects. If several images show as many, it is the one
-    in which the objects are largest on average, each as a fraction of its largest size in any image.
+    The camera is that of the training image that shows the most objects. Among images that show the same number, it is
+    the one with the largest mean size of the objects. Here, the size of an object is a fraction of its largest size in
+    any image.
 
     Args:
         path: File to write.
