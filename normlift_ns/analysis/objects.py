@@ -706,8 +706,8 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
 def _isolation(scene: GaussianScene, rows: Tensor) -> Float[Tensor, " m"]:
     """Return the first term of the score, log2(d / (s + s')).
 
-    d is the distance to the eighth nearest neighbor, s the largest scale of the Gaussian, and s' the median over its
-    neighbors of their largest scales.
+    Here, d is the distance to the eighth nearest neighbor, and s is the largest scale of the Gaussian. s' is the median
+    of the largest scales of the eight neighbors.
     """
     count = min(_FLOATER_NEIGHBORS, len(rows) - 1)
     neighbors = nearest_neighbors(scene.means[rows], count)

@@ -208,7 +208,7 @@ class AdaptiveBatches:
         """Yield the result rows of each part, one row per item. A batch may contain items of several parts.
 
         The last batch is padded with copies of its last item. All batches therefore have the same shape, unless the
-        batch size is reduced, and the other items of a batch change a row only by rounding.
+        batch size is reduced. The result row of an item depends on the other items of its batch only by rounding.
 
         The next part is requested when a batch has room for more items. The rows of a part are yielded together, after
         all of them are computed.

@@ -375,7 +375,7 @@ def _join_by_sorting(
 ) -> tuple[SparseRows, SparseRows]:
     """Compute the result of `_join` with one stable sort, which is faster on a GPU.
 
-    Entries of unlabeled pixels are sorted behind all entries of regions.
+    Entries of unlabeled pixels are sorted after all entries of regions.
     """
     is_region, new = _column_table([count for part in parts for count in part.num_regions], 0, 0)
     code = torch.where(is_region, new, -1 - new).to(device)  # index of the region, or -1 - view

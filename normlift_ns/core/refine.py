@@ -432,8 +432,8 @@ def shared_views(
 ) -> tuple[Float64[Tensor, " p"], Float64[Tensor, " p"]]:
     """Return the number of views in which two Gaussians share a region, and the number of views with regions of both.
 
-    If a Gaussian lies in several regions of a view, the first number counts the view with the probability that both
-    Gaussians lie in the same region.
+    A Gaussian may lie in several regions of a view. The first number then counts the view with the probability that
+    both Gaussians lie in the same region.
 
     Args:
         first, second, level: As in `shared_region_cosines`.

@@ -70,7 +70,7 @@ class SparseRows(TensorRecord):
         In every row, the columns of a list must be larger than those of earlier lists.
 
         On the CPU, nothing is sorted. Each row receives its entries of the first list, then those of the second, and so
-        on. On a GPU, a single stable sort is faster if it fits into memory.
+        on. On a GPU, a single stable sort of all entries is faster. It is used if it fits into memory.
         """
         dtype = parts[0][2].dtype if parts else torch.float32
         parts = [part for part in parts if part[0].numel() > 0]

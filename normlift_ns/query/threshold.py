@@ -114,8 +114,8 @@ def _histogram(values: Float64[np.ndarray, " n"], threshold: float, positions: t
 def picked_ranks(count: int) -> list[int]:
     """Return the ranks, in ascending order of relevancy, of the relevancies that `make_histograms` needs.
 
-    They are the ranks of the smallest and the largest relevancy, of u (which 20 Gaussians exceed, or one in a thousand
-    if these are fewer), and of those around the median and around the top.
+    They are the ranks of the smallest relevancy, the largest one and u, and those around the median and the top. Here,
+    u is the relevancy that 20 Gaussians exceed, or one in a thousand if these are fewer.
     """
     around = [min(int(share * (count - 1)) + i, count - 1) for share in (0.5, TOP_QUANTILE) for i in (0, 1)]
     return [0, count - 1, count - 1 - min(_SMALLEST_OBJECT, count // 1000), *around]

@@ -204,7 +204,7 @@ def exp(x: float) -> float:
 
 @overload(exp, jit_options={"error_model": "numpy", "fastmath": {"contract"}})
 def _compiled_exp(x):  # pragma: no cover (compiled)
-    """Compute e ** x = 2 ** n e ** r with |r| <= ln(2) / 2, by the polynomial of Cephes' expf or a Taylor series."""
+    """Compute e ** x = 2 ** n e ** r with |r| <= ln(2) / 2, by the expf polynomial of Cephes or a Taylor series."""
 
     def single(x):
         x = x if x > _LEAST32 else _LEAST32

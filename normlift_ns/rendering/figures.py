@@ -446,8 +446,8 @@ def save_overlays(
 ) -> list[Path]:
     """Write one PNG figure per camera and prompt and, for several cameras, one contact sheet per prompt.
 
-    The figure of a camera shows the training image, if it can be read, next to a render with the relevancy and an
-    outline of the selection. All figures share one color scale.
+    The figure of a camera shows a render with the relevancy and an outline of the selection. If the training image can
+    be read, it is shown next to the render. All figures share one color scale.
 
     Args:
         cameras: Training cameras by file name prefix, as `training_cameras` returns them.

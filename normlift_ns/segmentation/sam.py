@@ -569,7 +569,7 @@ class MaskRules:
     box_iou: float = 0.7
     """Largest IoU of two boxes that are both kept."""
     region_area: int = 100
-    """Number of pixels below which holes and pieces are removed."""
+    """Number of pixels below which holes are filled and pieces are removed."""
     suppression: mask_filtering.Suppression = field(default_factory=mask_filtering.Suppression)
 
 
