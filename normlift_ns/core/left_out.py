@@ -5,7 +5,7 @@ halves are swapped. Let s be a region of a left-out view, and u_j the directions
 If the consensus is enabled, these directions follow a consensus among the kept views. J and F' are those of
 `core.consensus`, with b = 1 for F'::
 
-    U_s        = normalize(sum_j E_js u_j)                      feature of s, rendered from the kept views
+    U_s        = normalize(sum_j E_js u_j)                      feature of s, predicted from the kept views
     V_s        = sum_t J_st F_t                                 over the kept regions t with J_st > 0.3
     recognized = U_s is nearer to F_s than to the feature of any other region of the same view and level
     confirmed  = V_s is nearer to F_s than to the feature of any other region of the same view and level

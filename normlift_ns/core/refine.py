@@ -200,9 +200,9 @@ def refine_subset(
 
 
 def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
-    """Resolve the options of a vote, and limit K to the number of other Gaussians and to `MAX_VOTERS`.
+    """Limit K to the number of other Gaussians and to `MAX_VOTERS`, and warn if this reduces K.
 
-    Warn if K is reduced.
+    Other options that are None, except tau and gamma, are set to the defaults of the kind of vote.
 
     >>> import warnings
     >>> with warnings.catch_warnings(record=True) as caught:

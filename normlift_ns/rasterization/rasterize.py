@@ -212,7 +212,7 @@ def rasterize_evidence(
         labels: One integer tensor [height, width] per view, with region ids 0, 1, … of this view. -1 means unlabeled.
             -2 means masked, and `lift` always ignores such pixels.
         num_regions: Number of regions per view (default: largest id + 1). Required if the feature table has rows for
-            regions without pixels.
+            regions above the largest id.
         backend: "torch" is the reference for any device and precision. "numba" is compiled for the CPU. "triton" is
             fast, for float32 on a GPU. "gsplat" is stock gsplat, for 3D Gaussians in float32 on a GPU, weight_power 1
             and constants that the installed version supports. "auto" selects the fastest backend for the device and the
@@ -509,7 +509,8 @@ def contributors(
     """Return the Gaussians that contribute to pixels, with their compositing weights A_pj (eq. 1 of the paper).
 
     The weights are exact, because each pixel is rasterized as a region. The sum of A_pj over the pixels of a region is
-    therefore its evidence. The sum over j of A_pj times the values of the Gaussians is the result of `render`.
+    therefore its evidence for weight_power 1. The sum over j of A_pj times the values of the Gaussians is the result of
+    `render`.
 
     Args:
         scene: N Gaussians. Gaussians with invalid parameters (see `GaussianScene.drawable`) do not contribute.
