@@ -92,7 +92,7 @@ def retry_in_halves(run: Callable[[Items], Result], items: Items, advice: str) -
 
 
 def init_cuda(device: str) -> None:
-    """Initialize CUDA and Triton in background threads, because both take about a second.
+    """Initialize CUDA and Triton in background threads if the device is a GPU. Both take about a second.
 
     Errors are ignored here. They occur again at the first use of the GPU.
     """

@@ -470,8 +470,9 @@ def _join_fragments(labels: Int32[np.ndarray, "h w"], smallest: float) -> Int32[
 
     Args:
         labels: Any labels. Two pieces with the same label become two regions.
-        smallest: Number of pixels below which a piece joins the neighbor with which it shares the longest boundary. If
-            all its neighbors are small, it joins the region of the first of them that has joined one.
+        smallest: Number of pixels below which a piece is small. A small piece joins the region of a neighbor that is
+            not small or has already joined a region. Of several such neighbors, it is the one with the longest shared
+            boundary.
     """
     pieces, count = _connected_pieces(labels)
     size = np.bincount(pieces.ravel())
