@@ -119,8 +119,8 @@ def relevancy(
             negative, in -2..2.
         temperature: Factor of the cosines inside the softmax, > 0.
     Raises:
-        ValueError: If a cosine is outside -1..1 by more than 0.01, `temperature` is out of range, the rule is unknown, or the rule needs
-            negatives and none are given.
+        ValueError: If a cosine is outside -1..1 by more than 0.01, `temperature` is out of range, the rule is unknown,
+            or the rule needs negatives and none are given.
 
     >>> import torch
     >>> from normlift_ns import relevancy

@@ -625,7 +625,7 @@ class SamMasks(RegionDefaults):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """All settings that change the label maps. Checkpoint files are identified by their content, not by their path."""
+        """All settings that change the label maps. Checkpoint files are identified by their content, not their path."""
         precision = resolve_precision(self.precision, self.device)
         return {"kind": "sam", "checkpoint": self._checkpoint, "precision": precision, "rules": asdict(self.rules)}
 
