@@ -147,7 +147,7 @@ class Answer:
         return {name: as_numpy(x) for name, x in (*arrays.items(), ("reliability", self.field.scalars.reliability))}
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Return the numbers of every prompt as plain Python types."""
+        """Return the result of `Finding.to_json` for every prompt."""
         on_gpu = not isinstance(self.relevancy, np.ndarray) and self.relevancy.is_cuda
         if on_gpu and len(self) >= _THREADS and bool(self.valid.any()):
             return self._summarize()
@@ -304,7 +304,7 @@ class Finding:
         return find_objects(self.answer.field, self.answer.means, self.mask).objects
 
     def to_json(self) -> dict[str, Any]:
-        """Return the numbers as plain Python types."""
+        """Return the prompt, its verdict, its numbers and its histogram as plain Python types."""
         names = ("text", "fraction", "centroid", "extent", "peak", "mean_reliability", "verdict", "nearest", "read_as")
         values = {name: getattr(self, name) for name in (*names, "suggested_threshold")}
         return {**values, "histogram": None if self.histogram is None else self.histogram.to_json()}

@@ -47,7 +47,7 @@ class QueryRequest(Question, frozen=True, forbid_unknown_fields=True):
 
 
 class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Selection of Gaussians by prompts, an object, a ray, a region or a mask, or of the likely floaters."""
+    """Selection of Gaussians by prompts, an object, a ray, a region or a mask. It can also be the likely floaters."""
 
     question: Question | None = None
     """Prompts that select Gaussians; None to select without prompts."""
