@@ -193,8 +193,8 @@ def with_original_reliability(scalars: Scalars, original: Scalars) -> Scalars:
 def apply_consensus(
     features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0, least: float = CHANCE_AGREEMENT
 ) -> Float[Tensor, "s d"]:
-    """Return F', the features after the consensus, for the regions of one level. Regions without overlaps keep their
-    rows of F."""
+    """Return F', the features after the consensus, for the regions of one level. Regions without overlaps or without a
+    direction keep their rows of F."""
     strength = min(1.0, max(0.0, (overlaps.agreement - least) / AGREEMENT_RAMP))
     if strength == 0 or overlaps.iou.weight.numel() == 0:
         return features

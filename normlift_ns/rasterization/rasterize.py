@@ -215,8 +215,8 @@ def rasterize_evidence(
             regions above the largest id.
         backend: "torch" is the reference for any device and precision. "numba" is compiled for the CPU. "triton" is
             fast, for float32 on a GPU. "gsplat" is stock gsplat, for 3D Gaussians in float32 on a GPU, weight_power 1
-            and constants that the installed version supports. "auto" selects the fastest backend for the device and the
-            precision.
+            and constants that the installed version supports. "auto" selects the fastest backend for the device, the
+            precision, the kind of Gaussians and the weight power.
         progress: Callback after every view, with the number of finished views and the number of all views, or None if
             the latter is unknown.
         options: Keyword arguments of `RasterOptions`.
