@@ -527,7 +527,8 @@ def _export_masks(job: ExportJob, folder: Path) -> list[str]:
     assert job.answer is not None
     settings = RasterSettings.recorded(job.field.manifest)
     kwargs = {"invert": job.rest, "settings": settings, "overwrite": job.overwrite}
-    lines = [f"{len(write_masks(job.scene, job.answer.mask, folder, **kwargs))} masks in {folder}"]
+    count = len(write_masks(job.scene, job.answer.mask, folder, **kwargs))
+    lines = [f"{count} mask{'s' * (count != 1)} in {folder}"]
     with suppress(FileNotFoundError, InputError):  # the first image may be missing
         if job.scene.train[0].original is not None:
             lines.append(

@@ -653,9 +653,9 @@ def check_directions(counts: Int64[Tensor, " 2"], total: int, source: FeatureSou
         )
     if lifted == 0:
         raise InputError(
-            f"none of the {total:,} Gaussians received a direction, although they have regions (from "
+            f"none of the {total:,} Gaussians received a direction, although some of them appear in regions (from "
             f"{_describe(source)}). Check whether the features cancel out in every Gaussian. If unlabeled pixels "
-            "outweigh them, give --unlabeled ignore"
+            "outweigh the regions, give --unlabeled ignore"
         )
     if lifted < _MIN_LIFTED_SHARE * total:
         warnings.warn(

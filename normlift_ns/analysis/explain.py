@@ -340,14 +340,15 @@ class RecordedVotes:
         missing = [name for name in names if name not in set(self.scene.train.names)]
         if len(missing) > 0:
             raise InputError(
-                f"the dataset no longer has {len(missing)} of {len(names)} images of the lift, such as {missing[0]}. "
+                f"images of the lift are missing from the dataset ({len(missing)} of {len(names)}, the first is "
+                f"{missing[0]}). "
                 "Restore the images, give the path of the dataset with --data, or lift again with: ns-normlift"
             )
         store = self.field.store
         if isinstance(store, StoredEvidence) and store.evidence.num_views != len(names):
             raise InputError(
-                f"the run lists {len(names)} images, but has evidence from {store.evidence.num_views} images; lift "
-                "again with: ns-normlift"
+                f"the run is damaged: number of lifted images {len(names)}, but number of images with evidence "
+                f"{store.evidence.num_views}; lift again with: ns-normlift"
             )
         return tuple(names)
 

@@ -78,7 +78,10 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
         ValueError: `points` is empty or contains numbers that are not finite.
     """
     if len(points) == 0 or not np.isfinite(points).all():
-        raise InputError(f"a box needs one or more points, all finite; got {len(points)} points")
+        finite = int(np.isfinite(points).all(axis=1).sum())
+        raise InputError(
+            f"a box needs at least one point, and only finite points; got {len(points)} points, {finite} of them finite"
+        )
     axes = _axes(points[_central(points)])
     low, high = np.quantile(points @ axes.T, BOX_QUANTILES, axis=0)
     order = np.argsort(low - high, kind="stable")

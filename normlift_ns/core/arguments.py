@@ -91,7 +91,8 @@ def check_rows(name: str, rows: Any, size: int, low: int = 0) -> None:
         return
     first, last = map(int, rows.aminmax())
     if first < low or last >= size:
-        raise InputError(f"{name} must be in {low}..{size - 1}, got {first if first < low else last}")
+        expected = f"in {low}..{size - 1}" if size > low else "empty"
+        raise InputError(f"{name} must be {expected}, got {first if first < low else last}")
 
 
 class _Names(dict[str, Any]):
