@@ -70,7 +70,7 @@ def _warning(finding: Finding) -> str:
     if finding.peak is None or bool(finding.mask.any()):
         return read_as.strip()
     question = finding.answer.question
-    if finding.peak > question.threshold:
+    if question.min_reliability > 0 and finding.peak > question.threshold:
         return read_as + (
             f"{finding.text}: no Gaussian above the threshold of {question.threshold:.2f} has a reliability of at "
             f"least {question.min_reliability:.2f}. Lower the minimum reliability."
