@@ -242,7 +242,8 @@ def _function_check(parts: Sequence[Any]) -> _Check:
         try:
             inspect.signature(value if callable(value) else lambda: 0).bind(*arguments)
         except TypeError:
-            raise _error(name, f"a function of {len(arguments)} arguments", value) from None
+            count = f"{len(arguments)} argument{'s' * (len(arguments) != 1)}"
+            raise _error(name, f"a function of {count}", value) from None
         except ValueError:  # some built-in functions have no signature
             pass
 
