@@ -60,7 +60,7 @@ def semantic_columns(field: SemanticField, answer: Answer | None, instances: Ins
     """
     if answer is not None and len(answer.relevancy) != len(field):
         raise InputError(
-            f"answer has {len(answer.relevancy):,} Gaussians, but the run has {len(field):,}; pass an answer from "
+            f"answer is for {len(answer.relevancy):,} Gaussians, but the run has {len(field):,}; pass an answer from "
             "this run"
         )
     scores = {"reliability": field.scalars.reliability, "n_eff": field.scalars.n_eff}
@@ -368,7 +368,8 @@ def read_cloud(path: Path) -> PlyData:
     """
     expected = "Expected a point cloud or mesh in PLY format whose vertices have x, y and z."
     if not path.is_file():
-        raise FileNotFoundError(f"{path}, the point cloud to label, does not exist. {expected}")
+        problem = "is not a regular file" if path.exists() else "does not exist"
+        raise FileNotFoundError(f"{path}, the point cloud to label, {problem}. {expected}")
     check_ply_header(path)
     try:
         cloud = PlyData.read(str(path), mmap="c")

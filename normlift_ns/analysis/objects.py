@@ -696,7 +696,7 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
     """
     limit = check_number("floater_threshold", limit)
     if len(scalars.norm) != len(scene):
-        raise InputError(f"scalars has {len(scalars.norm):,} Gaussians, but the scene has {len(scene):,}")
+        raise InputError(f"scalars are for {len(scalars.norm):,} Gaussians, but the scene has {len(scene):,}")
     rows = (scene.drawable & (scene.opacities >= MIN_OPACITY)).nonzero().squeeze(1)
     score = torch.full((len(scene),), -torch.inf, device=scene.means.device)
     if len(rows) > 1:

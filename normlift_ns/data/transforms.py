@@ -118,7 +118,8 @@ def read_json_file(path: Path, expected: str) -> Any:
         ValueError: The file is too large, is not valid JSON, or is nested too deeply.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"The file {path} does not exist. Expected {expected}.")
+        problem = "is not a regular file" if path.exists() else "does not exist"
+        raise FileNotFoundError(f"{path} {problem}. Expected {expected}.")
     if path.stat().st_size > _MAX_JSON_BYTES:
         raise InputError(
             f"{path} has {path.stat().st_size:,} bytes, expected at most {_MAX_JSON_BYTES:,}. Give {expected}."
