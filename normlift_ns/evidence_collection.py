@@ -202,7 +202,7 @@ class ViewBatch(NamedTuple):
 
 
 def chunk_views(views: Sequence[int], processes: int = 1) -> list[Sequence[int]]:
-    """Split views into chunks of at most 16; an interrupted lift loses the results of at most one chunk.
+    """Split views into chunks of at most 16; an interrupted lift loses the results of at most one chunk per process.
 
     Every process gets the same number of chunks, if there are enough views, and the sizes of chunks differ by at most
     one view. The evidence of a view does not depend on the other views in its chunk.

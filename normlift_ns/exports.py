@@ -39,7 +39,7 @@ from normlift_ns.rendering.figures import write_masks
 
 
 SplatFormat = Literal["ply", "compressed_ply", "glb", "spz", "spz4"]
-"""File format of an exported splat. spz is version 3 of SPZ, which more programs support; spz4 is version 4."""
+"""File format of an exported splat. spz is version 3 of SPZ, and spz4 is version 4, which fewer programs support."""
 _FORMATS: dict[str, SplatFormat] = {".compressed.ply": "compressed_ply", ".glb": "glb", ".spz": "spz"}
 """Formats by the ending of a file name. All other endings mean PLY, except those in `_UNWRITTEN`."""
 _UNWRITTEN = (".splat", ".sog", ".ksplat", ".gltf")
@@ -116,7 +116,7 @@ class TrainedSplat(NamedTuple):
     def columns(self) -> dict[str, np.ndarray]:
         """Return the vertex properties of `ns-export gaussian-splat`, in its order.
 
-        Opacities are logits and scales are logarithms, as splatfacto stores them.
+        Opacities are logits and scales are logarithms, as splatfacto stores them. Colors without harmonics become f_dc.
         """
         splat = self.with_harmonics()
         values, rest = splat.parameters, splat.features_rest
@@ -162,12 +162,12 @@ def write_splat(
     file_format: SplatFormat | None = None,
     overwrite: bool = False,
 ) -> WrittenSplat:
-    """Write a splat, and the scene indices of its Gaussians in the order of the file to <stem>_rows.npy next to it.
+    """Write a splat, and next to it <stem>_rows.npy with the scene indices of its Gaussians, in the order of the file.
 
-    If there are instances, also write the names of classes and objects to <stem>_names.json, and if there are
-    `labels.objects`, write them to <stem>_objects.json. Otherwise, `overwrite` deletes these files of an
-    earlier export. PLY and GLB files contain reliabilities, relevancies and labels; the other formats have no columns
-    for them.
+    With an answer or instances, also write the names of classes and objects to <stem>_names.json. With
+    `labels.objects`, also write them to <stem>_objects.json. If a JSON file is not written, `overwrite` deletes that of
+    an earlier export. Uncompressed PLY files and GLB files contain reliabilities, relevancies and labels; the other
+    formats have no columns for them.
 
     Args:
         path: Path of the file.
@@ -508,7 +508,7 @@ def transfer_labels(
     scene: Scene, field: SemanticField, answer: Answer, instances: Instances, transfer: CloudTransfer, path: Path,
     *, overwrite: bool = False,
 ) -> LabelTransfer:  # fmt: skip
-    """Write a cloud with the relevancies, class and object of the nearest visible Gaussians; see `label_cloud`."""
+    """Write a cloud with the relevancies, class and object of the visible Gaussian nearest to each point."""
     columns = TrainedSplat.of(scene).columns()
     rows = exportable_rows(columns, torch.ones(len(field), dtype=torch.bool))
     means = scene.gaussians.means[torch.from_numpy(rows)].double().cpu().numpy()

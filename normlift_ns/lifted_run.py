@@ -247,8 +247,8 @@ class LiftedRun:
     ) -> Int64[ndarray, " m"]:
         """Write Gaussians to a file, and their row indices in the scene to <stem>_rows.npy next to it.
 
-        With an answer, the names of its classes and objects are written to <stem>_names.json. PLY and GLB files also
-        contain reliabilities, and with an answer relevancies and labels.
+        PLY and GLB files also contain reliabilities. If there is an answer, they also contain its relevancies and
+        labels, and the names of its classes and objects are written to <stem>_names.json.
 
         Args:
             path: File to write. Names that end with .glb, .spz or .compressed.ply select these formats, and all other
@@ -308,7 +308,7 @@ class LiftedRun:
         Args:
             folder: Folder to write to.
             part: Answer or finding that selects the Gaussians, or a mask of Gaussians.
-            rest: Invert the masks. Pixels without any Gaussian are then 255 as well.
+            rest: Invert the masks. Empty pixels are then 255.
             overwrite: Replace files of these names.
         Raises:
             FileExistsError: A file exists and `overwrite` is False.
@@ -421,8 +421,8 @@ class LiftedRun:
         Args:
             part: Answer or finding that selects the Gaussians, or a mask of Gaussians. Objects of a mask have no text.
                 A Gaussian that several prompts select belongs to the prompt with the largest relevancy.
-            meters_per_unit: Length of one unit of the capture in meters. If given, positions in the capture are in
-                meters.
+            meters_per_unit: Length of one unit of the capture in meters. If given, positions and sizes in the capture
+                are in meters.
         Raises:
             ValueError: The mask has the wrong type or length, `meters_per_unit` is not positive, or
                 dataparser_transforms.json is damaged.

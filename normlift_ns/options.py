@@ -506,9 +506,10 @@ class SourceOptions:
     """Encoder of regions and prompts. open_clip: CLIP, applied to masked crops or to patches. siglip, siglip2,
     metaclip2: networks of the transformers library, applied in the same way. imagenet: a small classifier; prompts are
     names of its 1,000 classes, or of groups of classes such as dog. Fetch its weights with ns-normlift-weights --get
-    imagenet. color: mean colors, compared with color names; needs no weights. auto: open_clip if its options or
-    --features langsplat are given. Otherwise, auto selects the first of open_clip, siglip2, siglip, metaclip2, imagenet
-    and color whose default weights are on this machine. Any other name: an encoder from an installed plugin."""
+    imagenet. color: mean colors, compared with color names; needs no weights. auto: open_clip if --encoder-model,
+    --encoder-pretrained, --prompt-template or --features langsplat is given. Otherwise, auto selects the first of
+    open_clip, siglip2, siglip, metaclip2, imagenet and color whose default weights are on this machine. Any other name:
+    an encoder from an installed plugin."""
     encoder_model: str = DEFAULT_MODEL
     """Network of the encoder. open_clip: the name of an architecture. siglip, siglip2, metaclip2: a Hugging Face model
     name or a local folder. Without this option, siglip uses google/siglip-base-patch16-224, siglip2 uses
@@ -523,12 +524,12 @@ class SourceOptions:
     regions: str = "auto"
     """Image regions, each of which gets one feature. sam: masks of SAM. sam3: masks of SAM 3 for text prompts; see
     --sam3-prompts. edges: regions bounded by edges from a small network; fetch its weights with ns-normlift-weights
-    --get edges. patches: patches of a vision transformer. superpixel: pixels of similar color and position. grid:
-    squares. files: label maps from --regions-dir. auto: files with --regions-dir, and sam with --sam-model. Otherwise,
-    auto selects superpixel for the encoder color. For a neural network on a GPU, it selects the first of sam, edges and
-    patches that this machine and the network support. If there is none, it selects superpixel. On a CPU, it does the
-    same without sam. Patches then come before edges if the network encodes each region as a crop, as CLIP does. Any
-    other name: a mask source from an installed plugin."""
+    --get edges. patches: patches of a grid, which the network encodes without masks. superpixel: pixels of similar
+    color and position. grid: squares. files: label maps from --regions-dir. auto: files with --regions-dir, and sam
+    with --sam-model. Otherwise, auto selects superpixel for the encoder color. For a neural network on a GPU, it
+    selects the first of sam, edges and patches that this machine and the network support. If there is none, it selects
+    superpixel. On a CPU, it does the same without sam, and prefers patches to edges if the network encodes each region
+    as a crop, as CLIP does. Any other name: a mask source from an installed plugin."""
     sam3_prompts: tuple[str, ...] = ()
     """Prompts for the masks of --regions sam3. If there are none, SAM 3 uses the prompts of --queries."""
     region_count: int | None = None
@@ -550,8 +551,7 @@ class SourceOptions:
     level: str | None = None
     """Level of the regions. files: the index of the map in NPY files of shape [levels, H, W]. edges: s, m or l for
     about 300, 120 or 40 regions per image (None: m). sam and langsplat: s, m or l for subparts, parts or wholes (None:
-    l). `default` puts all masks of SAM into one map. langsplat also accepts sum, which adds the vectors of all
-    levels."""
+    l), or default for all masks of SAM in one map. langsplat also accepts sum, which adds the vectors of all levels."""
     features: FeatureKind = "none"
     """Precomputed regions and features to use instead of encoding the images. langsplat: files in --features-dir that
     LangSplat's preprocessing wrote. none: encode the images."""
@@ -560,7 +560,7 @@ class SourceOptions:
     features_missing: MissingFeatures = "error"
     """Action if images have no precomputed features. error: stop. skip: leave these images out of the lift."""
     text_embeddings: Path | None = None
-    """NPZ file with one vector per prompt, used instead of the text encoder. It needs --features langsplat."""
+    """NPZ file with one vector per prompt, used instead of the text encoder. Needs --features langsplat."""
 
     def __post_init__(self) -> None:
         if self.regions not in get_args(RegionKind):
@@ -594,39 +594,40 @@ class SplatOptions:
     """
 
     colmap: Path | None = None
-    """Folder of a COLMAP project that contains images/ and sparse/0/."""
+    """Folder of a COLMAP project, such as one with images/ and sparse/0/."""
     transforms: Path | None = None
     """Camera file transforms.json of nerfstudio, instant-ngp or Blender, instead of --colmap."""
     images: Path | None = None
     """Folder of the images, or of smaller copies such as images_4. None: images/ of the COLMAP project, or the paths in
     transforms.json."""
     masks: Path | None = None
-    """Folder with one mask per image. The lift ignores pixels with a mask value of zero."""
+    """Folder with one mask per image. The lift ignores pixels with a mask value of zero. None: the masks that
+    transforms.json names, if any."""
     world_transform: Path | Literal["auto"] | None = "auto"
     """Transform from the world of the cameras to that of the splat. auto: if the splat does not fit its images, search
     for a rotation, normalization or scaling that common tools apply. A path: a file with a similarity transform as a 4
     x 4 matrix, or the dataparser_transforms.json of the run that exported the PLY file. None: no search, and no
     transform except that of --gsplat-normalize."""
     gsplat_normalize: bool = True
-    """For a splat from gsplat's trainer: assume that the trainer normalized the world, and recompute the normalization
-    from the COLMAP project. The setting in the trainer's cfg.yml takes precedence. For other splats, --world-transform
-    auto also tries this normalization."""
+    """For a splat from gsplat's trainer: assume that the trainer normalized the world, unless its cfg.yml records that
+    it did not, and recompute the normalization from the COLMAP project. False: assume no normalization, whatever
+    cfg.yml records. For other splats, --world-transform auto also tries this normalization."""
     views: Literal["train", "all"] = "train"
     """Images to lift. train: the images that were used for training. all: also images held out of training."""
     test_every: int | None = None
     """Interval n of held-out images: training left out every n-th image, starting with the first. gsplat's trainer and
-    Inria's trainer with --eval use 8. None: as in the cfg.yml of gsplat's trainer or the cfg_args of Inria's trainer,
-    or else the held-out images in transforms.json."""
+    Inria's trainer with --eval use 8. None: as recorded in the cfg.yml of gsplat's trainer or, with --colmap, in the
+    cfg_args of Inria's trainer. Without a record, the held-out images are those that transforms.json names, if any."""
     eval_images: tuple[str, ...] = ()
-    """Images held out of training, instead of --test-every: image names, a text file of names, or a fraction. The
-    fraction 0.1 is the default of ns-train."""
+    """Images held out of training, instead of --test-every: image names, a text file of names, or the fraction of
+    held-out images, such as 0.1, the default of ns-train."""
     rasterize_mode: RasterizeMode | None = None
     """Rasterization mode that the splat was trained with. None: as recorded in the file, in the cfg.yml of gsplat's
     trainer or in the cfg_args of Inria's trainer, else classic."""
     primitive: Primitive | None = None
     """Kind of the Gaussians. 2dgs: the flat Gaussians of 2D Gaussian Splatting, whose third scale is not used. None:
-    2dgs if gsplat's trainer recorded 2D Gaussians, the PLY file has two scales, or the file name contains 2dgs;
-    otherwise 3dgs."""
+    2dgs if the PLY file has two scales, else the kind that gsplat's trainer recorded. Without a record, 2dgs if the
+    file name contains 2dgs, else 3dgs."""
     background: Background | None = None
     """Background color behind the splat, and behind images with an alpha channel. None: as in the cfg_args of Inria's
     trainer, else black."""
@@ -690,12 +691,12 @@ class RefineConfig(CheckedOptions):
     """Margin Delta by which the best neighbor must win the vote, >= 0. Larger values change fewer Gaussians.
     None: 0."""
     min_labeled: float | None = None
-    """Share of a Gaussian's weight that must lie in regions for its direction to change, in 0..1. With larger values,
-    objects without a mask take fewer directions from their neighbors. Gaussians that no view shows may always change.
-    None: 0.2 for posterior, 0 for paper."""
+    """Minimum share of a Gaussian's weight that must lie in regions for its direction to change, in 0..1. With larger
+    values, objects without a mask take fewer directions from their neighbors. Gaussians that no view shows may always
+    change. None: 0.2 for posterior, 0 for paper."""
     prior: float = 4.0
-    """Weight of all neighbors together in a posterior vote, in views, >= 0. With larger values, the neighbors also
-    overrule Gaussians with more views."""
+    """Weight of all neighbors together in a posterior vote, in views, >= 0. With larger values, the neighbors overrule
+    even directions that many views support."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the state. Configs of version 0.1 do not name the kind of vote, which was always the paper's."""
@@ -725,9 +726,10 @@ class LiftOptions(CheckedOptions):
     """Images that the encoder receives. photos: the training images. render: renders of the trained scene from the same
     cameras."""
     max_views: int | None = None
-    """Maximum number of evenly spaced training views. More views are slower and more reliable. None: all."""
+    """Maximum number of training views to lift, evenly spaced. More views take longer and give more reliable results.
+    None: all."""
     lift_downscale: int = 1
-    """Divisor of the size of images and cameras, at least 1. Larger values are faster and coarser."""
+    """Divisor of the width and height of images and cameras, at least 1. Larger values are faster and coarser."""
     reliability_beta: float = 1.0
     """Strength beta of the prior in the reliability R, as a number of views, >= 0. Larger values lower R, most for
     Gaussians with few views."""
@@ -741,8 +743,8 @@ class LiftOptions(CheckedOptions):
     weight_power: Literal[1, 2] = 1
     """Exponent of the rasterization weights A_ij: 1 as in the paper, or 2 for squared weights."""
     consensus: bool = True
-    """Before the lift, move the feature of each region toward those of regions in other views that cover the same
-    Gaussians."""
+    """Before the lift, move the features of regions toward those of regions in other views that cover the same
+    Gaussians. This requires enough agreement between the views; see --consensus-min-agreement."""
     consensus_power: float = 1.0
     """Exponent on the overlap fraction in the consensus, >= 0. Larger values down-weight regions that cover more than
     the target region. Needs --consensus True."""
@@ -759,11 +761,11 @@ class LiftOptions(CheckedOptions):
     result to compare captures, encoders and settings without labels. The measurement does not change the lift, and
     takes a few seconds."""
     refine: bool = True
-    """Repair directions by a vote among neighboring Gaussians. A Gaussian copies the direction of a neighbor that wins
-    the vote, or keeps its own."""
+    """Repair directions by a vote among neighboring Gaussians. A Gaussian copies the direction of the neighbor that
+    wins the vote, or keeps its own."""
     vote: RefineConfig = field(default_factory=RefineConfig)
     tolerance: float = 1e-3
-    """Maximum error that --storage auto or low_rank may add to any cosine, > 0. Larger values give smaller files."""
+    """Maximum error that --storage auto or low_rank may add to any cosine, > 0. Larger values allow smaller files."""
     storage: Storage | Literal["auto"] = "auto"
     """Storage format of directions. evidence: the exact evidence. float16: half-precision vectors. low_rank:
     coordinates in a low-rank basis. auto: the smallest format within --tolerance."""
@@ -772,8 +774,8 @@ class LiftOptions(CheckedOptions):
     throughout, which is slow on a GPU."""
     backend: BackendName = "auto"
     """Rasterization backend. triton: kernels of this package for a GPU. gsplat: kernels of gsplat for a GPU. numba:
-    compiled code for the CPU. torch: PyTorch code for any device, which is slow. auto: the fastest backend for the
-    device and the precision."""
+    compiled code for the CPU. torch: PyTorch code for any device, which is slow. auto: the fastest backend that
+    supports the device, the splat and the other options."""
     gsplat_version: GsplatVersion = "auto"
     """gsplat version whose rasterization rules the lift reproduces; it must be the version that trained the scene.
     installed: the version on this machine. auto: the version recorded with the scene, or else 1.4. Version 1.6 is not
@@ -797,14 +799,14 @@ class AskOptions:
     """
 
     negatives: tuple[str, ...] | None = None
-    """Negative prompts for the formulas lerf and margin. None: those of the encoder, or else object, things, stuff and
-    texture (from LERF)."""
+    """Negative prompts for the formulas lerf and margin. None: object, things, stuff and texture (from LERF), except
+    for encoders of plugins with negative prompts of their own."""
     relevancy: RelevancyRule | Literal["auto"] = "auto"
-    """Relevancy formula. contrast: the softmax against unrelated words at every Gaussian. cosine: the cosine itself.
-    lerf: the smallest softmax against any negative. margin: the cosine minus the largest cosine of a negative. auto:
-    lerf if --negatives has prompts, and cosine if it is empty. Without --negatives, contrast if the lift compared the
-    scene with unrelated words, else lerf if the text encoder has default negatives, else cosine. Encoders of plugins
-    may have another default."""
+    """Relevancy formula. cosine: the cosine of prompt and Gaussian. contrast: the softmax against the cosine that 3% of
+    unrelated words reach at the same Gaussian. lerf: the smallest softmax against one negative prompt. margin: the
+    cosine minus the largest cosine of a negative prompt. auto: lerf if --negatives has prompts, and cosine if it is
+    given without prompts. Without --negatives, contrast if the lift compared the scene with unrelated words, else lerf
+    if the text encoder has default negatives, else cosine. Encoders of plugins may have another default."""
     threshold: float | Literal["auto"] | None = None
     """Relevancy above which a Gaussian is selected. Larger values select fewer Gaussians. auto: a threshold from the
     histogram of relevancies. None: 0.5 for contrast and lerf, 0.02 for margin, and auto for cosine. The encoder color

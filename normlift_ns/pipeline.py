@@ -1,6 +1,6 @@
 """Pipeline from a trained scene and a source of 2D features to a semantic field. Read this module first.
 
-`lift_run` opens a scene, lifts onto it and writes the lifted run. `lift_scene` runs the steps between in order:
+`lift_run` opens a scene, lifts features onto it and writes the lifted run. `lift_scene` only lifts, in these steps:
 features -> evidence -> consensus -> lift -> vote -> store. Both use one process; `distributed.lift` runs the same steps
 in several processes.
 """
@@ -759,7 +759,7 @@ def count_changes(
 def count_votes(
     copied: Int32[Tensor, " m"], gaussians: Int[Tensor, " m"], neighbors: Neighbors, reliability: Float[Tensor, " n"]
 ) -> Int64[Tensor, " 2"]:
-    """Return the number of Gaussians that copied another direction, and the number without support."""
+    """Return the number of Gaussians that copied another direction, and the number of `unsupported` Gaussians."""
     return torch.stack([(copied != gaussians).sum(), unsupported(neighbors, reliability).sum()])
 
 
@@ -873,13 +873,13 @@ class KernelWarmUp:
             )
 
     def wait_for_rendering(self) -> None:
-        """Start `start_rasterization`, and wait for the kernels of renders."""
+        """Call `start_rasterization`, and wait for the kernels of renders."""
         self.start_rasterization()
         for thread in self._rendering:
             thread.join()
 
     def wait_for_evidence(self) -> None:
-        """Start `start_rasterization`, and wait for all kernels that do not depend on the features."""
+        """Call `start_rasterization`, and wait for all kernels that do not depend on the features."""
         self.start_rasterization()
         for thread in (*self._rendering, *self._sums, *self._early):
             thread.join()

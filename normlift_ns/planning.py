@@ -64,7 +64,7 @@ class Rate:
     """Number of items in the whole lift."""
 
     def cost(self, share: float = 1.0) -> float:
-        """Return the cost of a share of the items.
+        """Return the fixed part plus the cost of a share of the items.
 
         >>> Rate(fixed=2.0, per_item=0.5, count=10).cost(0.5)
         4.5
@@ -641,7 +641,7 @@ def _per_view(observed: _Observed) -> float | None:
 def _observe_loaded(
     indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed], batch: int
 ) -> tuple[_Observed, float]:
-    """Observe views; return them with the seconds of all views without loading, and the seconds to load networks."""
+    """Observe views; return them with the seconds that loaded networks need, and the seconds to load networks."""
     if len(indices) == 0:
         return _Observed(evidence_collection.ViewBatch([], [], [], []), 0.0), 0.0
     first = observe(indices[:1])

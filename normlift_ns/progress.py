@@ -56,7 +56,7 @@ class StageTimer:
 def lift_cost(seconds: Mapping[str, float], device: str) -> dict[str, float]:
     """Return the seconds of each stage, their total, and the peak memory of this process and of the GPU in GiB.
 
-    The memory of the process is left out if the system does not report it, and that of the GPU for a lift on the CPU.
+    The process memory is left out if the system does not report it. The GPU memory is left out for a lift on the CPU.
     """
     peak = peak_gib()
     memory = {} if peak is None else {"memory_gib": peak}

@@ -26,8 +26,9 @@ def gaussians(
     quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
 ) -> GaussianScene:
     """Return a float32 scene of Gaussians with the same rotation."""
-    rows = (torch.tensor(x, dtype=torch.float32) for x in (means, [quat] * len(means), scales, opacities))
-    return GaussianScene(*rows)
+    columns = (means, [quat] * len(means), scales, opacities)
+    a, b, c, d = (torch.tensor(column, dtype=torch.float32) for column in columns)
+    return GaussianScene(a, b, c, d)
 
 
 def rasterized(
@@ -153,7 +154,7 @@ def out_of_range(setting: Setting) -> dict[str, float]:
     arrays = {name: getattr(others, name)[:1].repeat_interleave(len(bad), 0) for name in _PARAMETERS}
     for row, (name, column, value) in enumerate(bad):
         arrays[name][row, column] = value
-    mixed = GaussianScene(*(torch.cat([arrays[name], getattr(others, name)]) for name in _PARAMETERS))
+    mixed = replace(others, **{name: torch.cat([arrays[name], getattr(others, name)]) for name in _PARAMETERS})
     views, wrong = _views(2), 0
     for mode in ("classic", "antialiased"):
         for backend in setting.backends:

@@ -76,7 +76,8 @@ def built(plan: Plan, num_gaussians: int) -> DemoRoom:
     upper = normals * np.where(normals[:, 2:] < 0, -1, 1)
     quats = np.stack([1 + upper[:, 2], -upper[:, 1], upper[:, 0], np.zeros(len(upper))], axis=1)
     quats /= row_lengths(quats)[:, None]
-    scene = GaussianScene(*(torch.from_numpy(x).float() for x in (means, quats, scales, opacities)))
+    a, b, c, d = (torch.from_numpy(x).float() for x in (means, quats, scales, opacities))
+    scene = GaussianScene(a, b, c, d)
     names = tuple(name for name, *_ in all_parts)
     return DemoRoom(scene, torch.from_numpy(colors).float(), torch.from_numpy(labels), names)
 

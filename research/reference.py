@@ -43,7 +43,7 @@ This page is generated from the code: `python -m research.reference`. `--help` p
 torch.
 
 {flags} Options that are True or False are written `--refine False`, as in nerfstudio; `--save-query` alone means
-`--save-query True`. A value out of its range is refused before anything is loaded.
+`--save-query True`. Commands reject values that are out of range before they load anything.
 
 `ns-train normlift` has the options of `ns-normlift` too, as `--pipeline.source.…`, `--pipeline.lift.…` and
 `--pipeline.queries` ([training and lifting in one](train.md)).

@@ -340,8 +340,7 @@ class RecordedVotes:
         missing = [name for name in names if name not in set(self.scene.train.names)]
         if len(missing) > 0:
             raise InputError(
-                f"images of the lift are missing from the dataset ({len(missing)} of {len(names)}, the first is "
-                f"{missing[0]}). "
+                f"the dataset no longer has {len(missing)} of {len(names)} images of the lift (first: {missing[0]}). "
                 "Restore the images, give the path of the dataset with --data, or lift again with: ns-normlift"
             )
         store = self.field.store

@@ -67,8 +67,8 @@ class Inventory:
     instance_id: Int32[Tensor, " n"]
     """Number of the object of every Gaussian, from 1; 0 for Gaussians without an object."""
     catalog: Catalogue
-    """Catalog of the objects. The text of an object is a word of the vocabulary, or a number such as "object 3"; see
-    `name_objects`."""
+    """Catalog of the objects. The text of an object is a word of the vocabulary, or a numbered name such as "object 3";
+    see `name_objects`."""
 
     def __len__(self) -> int:
         return len(self.catalog.objects)
@@ -158,7 +158,7 @@ def list_inventory(
 
     Args:
         votes: Evidence of the lift, with its scene and its field.
-        vocabulary: Candidate names. An object keeps its number as its name if none of them fits.
+        vocabulary: Candidate names. If none of them fits an object, its name is "object" and its number.
         transform, meters_per_unit, device: As in `make_catalogue`.
     Raises:
         ValueError, FileNotFoundError: As in `RecordedVotes.table` and `make_catalogue`.
@@ -313,7 +313,7 @@ def mean_directions(
 def name_objects(
     field: SemanticField, instance_id: Int32[Tensor, " n"], directions: Float64[Tensor, "m d"], vocabulary: Vocabulary
 ) -> tuple[str, ...]:
-    """Return the name of every object, which is a word of the vocabulary or a number such as "object 3".
+    """Return the name of every object, which is a word of the vocabulary or a numbered name such as "object 3".
 
     The word must be the best name and stand out from other words (see `best_words`). It must also have the verdict
     "found", and select more than half of the object.
@@ -358,8 +358,8 @@ def best_words(
     """Return the index of the best name of every object; None if the best name does not stand out from other words.
 
     Some words are similar to everything. The cosines of each word are therefore standardized over the scene, and then
-    those of each object over the words that are not names. The score of the best name must exceed a limit. If the
-    scores of 20 objects were normally distributed, `by_chance` pairs of an object and a name would exceed this limit.
+    those of each object over the words that are not names. The score of the best name must exceed a limit. For normally
+    distributed scores of 20 objects, the expected number of pairs (object, name) above this limit is `by_chance`.
     If all words are names, the scores are standardized over all words, and the best name must also have the best score.
 
     Args:

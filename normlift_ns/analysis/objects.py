@@ -401,8 +401,8 @@ class CatalogueObject:
     views: int
     """Number of training images that show the object."""
     best_views: tuple[str, ...]
-    """Names of up to three images. Images of the whole object come before images of a part of it. In both groups,
-    images that show it larger come first."""
+    """Names of up to three images that show the object. Images of the whole object come before images of a part of it.
+    Both groups are sorted by the fraction of the image that the object covers, largest first."""
     capture: Placement
     """Position and size in the coordinates of the capture."""
     scene: Placement
@@ -417,13 +417,13 @@ class Catalogue:
     num_in_small_components: int
     """Number of selected Gaussians in components that are too small to be listed."""
     meters_per_unit: float | None
-    """Meters per unit of the capture; None if unknown. If known, `capture` positions are in meters."""
+    """Meters per unit of the capture; None if unknown. If known, `capture` positions and sizes are in meters."""
     view_shares: Float[Tensor, "m v"]
     """Fraction of each of V training images that each of M objects covers, on the CPU; see `view_shares`."""
 
     @property
     def unit(self) -> str:
-        """Unit of the `capture` positions."""
+        """Unit of the `capture` positions and sizes."""
         return "capture unit" if self.meters_per_unit is None else "metre"
 
     def to_json(self) -> dict[str, Any]:
@@ -709,8 +709,8 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
 def _isolation(scene: GaussianScene, rows: Tensor) -> Float[Tensor, " m"]:
     """Return the first term of the score, log2(d / (s + s')).
 
-    d is the distance to the eighth nearest neighbor, s the largest scale of the Gaussian, and s' the median over its
-    neighbors of their largest scales.
+    Here, d is the distance to the eighth nearest neighbor, and s is the largest scale of the Gaussian. s' is the median
+    of the largest scales of the eight neighbors.
     """
     count = min(_FLOATER_NEIGHBORS, len(rows) - 1)
     neighbors = nearest_neighbors(scene.means[rows], count)

@@ -78,8 +78,8 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
         raise InputError(f"Invalid options after --. {error}") from None
     if (name := next((name for name in _SOURCE_NAMES if getattr(common, name) is not None), None)) is not None:
         raise InputError(
-            f"--{name.replace('_', '-')} is given after --, but options there apply to every capture. Write it into "
-            f"{path}, with one line per capture."
+            f"--{name.replace('_', '-')} is given after --, but options there apply to every capture. Write this "
+            f"option into {path}, with one line per capture."
         )
     try:
         text = read_text(path, "utf-8-sig")
@@ -521,7 +521,7 @@ class NormLiftBatch(CheckedOptions):
     """Text file with one capture per line: the path of a config.yml, a splat file or a gsplat checkpoint. Options of
     ns-normlift for this capture may follow or replace the path."""
     options: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[-- OPTIONS, at the end]")] = ()
-    """Options of ns-normlift that apply to all captures, given after --."""
+    """Options of ns-normlift for all captures, given after --. Options in a line of the list take precedence."""
     results: Path | None = None
     """Folder for results, logs and claims, which all workers share. None: a folder next to the list, such
     as captures_batch for captures.txt."""

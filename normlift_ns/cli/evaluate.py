@@ -37,8 +37,8 @@ class NormLiftEval(CheckedOptions):
     """Paths to the config.yml files of lifted runs, one per scene."""
     protocol: Literal["scannet", "lerf", "masks", "none"] = "none"
     """Evaluation protocol. scannet: in 3D, with one Gaussian per labeled vertex. lerf: in 2D, with the polygons of
-    LERF-OVS. masks: in 3D and 2D, with instance masks of any capture. none: no ground truth and no scores; needs
-    --study coverage or timing."""
+    LERF-OVS. masks: in 3D and 2D, with instance masks of any capture, for a single run. none: no ground truth and no
+    scores; needs --study coverage or timing."""
     labels: tuple[Path, ...] = ()
     """Ground truth of each run, in the order of --load-config. scannet: a *_vh_clean_2.labels.ply file. lerf: a folder
     of JSON files. masks: a folder of instance masks. none: no ground truth."""
@@ -54,8 +54,9 @@ class NormLiftEval(CheckedOptions):
     the values of the run. signals: the share of Gaussians without evidence, accuracy by reliability and by the norm of
     the mean feature, and a comparison of reliability with opacity. timing: seconds of the lift and, on a GPU, of the
     method of SFS (Splat Feature Solver), which composites 512 channels with gsplat. baselines: scores of techniques
-    from SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage: regions without
-    reliable evidence, unused images that would help, and new camera poses, as renders and as a camera path."""
+    from SFS, Occam's LGS, VALA and Dr.Splat, reimplemented on the features of the run. coverage, for a single run:
+    parts of the scene without reliable evidence, unused images that would help, and new camera poses, as renders and as
+    a camera path."""
     compare: Literal["paper"] | None = None
     """Published results to compare with yours, in the printed tables and in the output file. paper: results of the
     paper for --protocol scannet or lerf, and for the studies ablation, signals and timing."""
@@ -64,7 +65,7 @@ class NormLiftEval(CheckedOptions):
     data: Path | None = None
     """Current path of the dataset, if it was moved. Works only with a single run in --load-config."""
     device: str = "auto"
-    """Device for the text encoder and --study: auto, cpu or cuda."""
+    """Device for the text encoder and --study: auto, cpu, cuda, or one GPU such as cuda:1."""
     scannet: ScannetOptions = field(default_factory=ScannetOptions)
     lerf: LerfOptions = field(default_factory=LerfOptions)
     masks: MaskOptions = field(default_factory=MaskOptions)

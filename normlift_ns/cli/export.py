@@ -41,20 +41,20 @@ class NormLiftExport(options.CheckedOptions):
     """Prompts to search for. Commas and semicolons separate prompts, except between double quotes. Without prompts, the
     command uses the queries stored in the run, if there are any, with their options."""
     select: Literal["scene", "selection", "rest", "clean"] = "scene"
-    """Gaussians to export. scene: all Gaussians. selection: Gaussians that any prompt selects. rest: Gaussians that no
-    prompt selects. clean: all except likely floaters, which float in front of the cameras instead of belonging to a
-    surface."""
+    """Gaussians to export. scene: all. selection: those that any prompt selects. rest: those that no prompt selects.
+    clean: all except likely floaters, which float in front of the cameras instead of belonging to a surface. Exports
+    always leave out invisible Gaussians, whose opacity is below 1/255 or whose parameters are not finite."""
     ask: options.AskOptions = field(default_factory=options.AskOptions)
     output_filename: str = "splat.ply"
     """Name of the splat file. Its ending selects the format: .ply, .compressed.ply, .glb or .spz. The command also
-    writes <name>_rows.npy, the index of each Gaussian in the run. With prompts, it also writes <name>_names.json (names
-    of class_id and instance_id) and <name>_objects.json (objects)."""
+    writes <name>_rows.npy, the index in the run of each exported Gaussian. With prompts, given or stored, it also
+    writes <name>_names.json (names of class_id and instance_id) and <name>_objects.json (objects)."""
     coordinates: Literal["scene", "capture"] = "scene"
     """Coordinate system of the exported Gaussians and objects. scene: that of the trained Gaussians and of viewers.
     capture: that of the original cameras, before the training rotated and scaled them."""
     masks_dir: Path | None = None
-    """Folder for a PNG mask of each training image, with 255 for pixels of selected Gaussians, else 0. --select rest
-    swaps the values. The masks fit the undistorted images that the scene was trained with."""
+    """Folder for a PNG mask of each training image, with 255 for pixels that mostly show selected Gaussians, else 0.
+    --select rest swaps the values. The masks fit the undistorted images that the scene was trained with."""
     arrays_dir: Path | None = None
     """Folder for the exported Gaussians as arrays: coord.npy, segment.npy, instance.npy and names.json. Classes and
     objects are numbered from 0; -1 marks Gaussians without a class or an object."""
@@ -63,7 +63,8 @@ class NormLiftExport(options.CheckedOptions):
     Each exporter writes <name>_<exporter> with its own suffix to the output folder."""
     transfer: Path | None = None
     """PLY point cloud or mesh to label. The command writes a copy, <name of the cloud>_labels.ply, with the class_id,
-    instance_id and relevancies of the nearest visible Gaussian. They are 0 if no Gaussian is near enough."""
+    instance_id and relevancies of the nearest visible Gaussian. They are 0 if no Gaussian is within
+    --transfer-distance."""
     transfer_distance: float = options.MAX_TRANSFER_DISTANCE
     """Maximum distance from a point to the center of its Gaussian for --transfer, > 0. Larger values label more points.
     The unit is the median distance from a Gaussian to the nearest one at another position."""
@@ -71,8 +72,8 @@ class NormLiftExport(options.CheckedOptions):
     """Coordinate system of the cloud for --transfer. capture: that of the original cameras, before the training rotated
     and scaled them. scene: that of the trained Gaussians."""
     object_max_gap: float = options.OBJECT_MAX_GAP
-    """Maximum gap between Gaussians of one object, > 0, in units of the selection's median spacing. Larger values merge
-    more objects."""
+    """Maximum gap between Gaussians of one object, > 0, in units of the median spacing of the Gaussians that its prompt
+    selects. Larger values merge more objects."""
     object_min_gaussians: int = options.OBJECT_MIN_GAUSSIANS
     """Minimum number of Gaussians in an object, at least 1. Larger values list fewer objects."""
     floater_threshold: float = options.FLOATER_THRESHOLD
@@ -82,7 +83,7 @@ class NormLiftExport(options.CheckedOptions):
     data: Path | None = None
     """Current path of the dataset, if it was moved."""
     device: str = "auto"
-    """Device for the text encoder: auto, cpu or cuda."""
+    """Device for the text encoder: auto, cpu, cuda, or one GPU such as cuda:1."""
 
     def main(self) -> Path:
         """Write the files and return the path of the splat file."""

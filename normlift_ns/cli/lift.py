@@ -46,7 +46,7 @@ def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
     """Join the other processes of the lift. Only the first process prints.
 
     Args:
-        device: Device to lift on: cpu, cuda or auto.
+        device: Value of --device.
     Yields:
         The communicator, or None if there is only one process.
     """
@@ -75,8 +75,9 @@ class NormLift(CheckedOptions):
     """Splat file to use instead of --load-config: PLY, compressed PLY, SPZ, .splat, GLB or glTF. Needs --colmap or
     --transforms."""
     load_gsplat: Path | None = None
-    """Checkpoint ckpt_<step>_rank0.pt of gsplat's simple_trainer, to use instead of --load-config. Needs --colmap, or
-    --transforms with --gsplat-normalize False or a file in --world-transform."""
+    """Checkpoint ckpt_<step>_rank0.pt of gsplat's simple_trainer, to use instead of --load-config. Needs --colmap
+    or --transforms. If the trainer normalized the world, --transforms also needs --world-transform FILE. If it did not,
+    add --gsplat-normalize False, unless its cfg.yml records that."""
     splat: SplatOptions = field(default_factory=SplatOptions)
     add_images: Path | None = None
     """COLMAP project folder or transforms.json with images taken after training, which the lift then uses too. It must
@@ -96,9 +97,10 @@ class NormLift(CheckedOptions):
     timestamp: str | None = None
     """Name of the new run directory. None: the current time."""
     overwrite: bool = False
-    """Replace an existing run directory that has the same --timestamp, and exported files whose content differs."""
+    """Replace an existing run directory that has the same --timestamp, and files in --export-langsplat whose content
+    differs."""
     device: str = "auto"
-    """Device to lift on: auto, cpu or cuda."""
+    """Device to lift on: auto, cpu, cuda, or one GPU such as cuda:1."""
     num_devices: int = 1
     """Number of processes on this machine, each with its own GPU or an equal share of the CPU cores. For several
     machines, use torchrun."""
@@ -319,7 +321,7 @@ def keep_freed_memory() -> None:
 
 @contextmanager
 def frequent_switches() -> Iterator[None]:
-    """Let threads take turns ten times as often, so that one that reads files does not wait for one that imports."""
+    """Switch between threads ten times as often, so that threads that read files do not wait for imports."""
     interval = sys.getswitchinterval()
     sys.setswitchinterval(interval / 10)
     try:

@@ -38,6 +38,7 @@ from normlift_ns.options import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.table import Table
 
     from normlift_ns.analysis.explain import RecordedVotes, ViewVote, Why
@@ -77,14 +78,16 @@ class NormLiftQuery(CheckedOptions):
     history: bool = True
     """Keep a history of --interactive prompts in a file that only you can read."""
     coordinates: Literal["scene", "capture"] = "scene"
-    """Coordinate system of all positions in tables and --output-json. scene: that of the Gaussians and of viewers.
-    capture: that of the original cameras, before the training rotated and scaled them."""
+    """Coordinate system of the positions in tables and --output-json. scene: that of the Gaussians and of viewers.
+    capture: that of the original cameras, before the training rotated and scaled them. The JSON file of
+    --inventory has both. --meters-per-unit sets the table of objects to capture."""
     save_query: bool = False
     """Store the queries in the run in place of earlier ones. ns-render and ns-viewer then show their relevancy."""
     output_json: Path | None = None
     """JSON file for the table."""
     output_npz: Path | None = None
-    """NPZ file for relevancy [N, Q], reliability [N], valid [N] and names [Q], for N Gaussians and Q prompts."""
+    """NPZ file for relevancy [N, Q], reliability [N], valid [N] and names [Q], for N Gaussians and Q prompts. --segment
+    adds segment_relevancy, segment_reliability and segment_agreement, each [N, Q]."""
     render_dir: Path | None = None
     """Folder for renders of the relevancy."""
     render_views: tuple[str, ...] = ()
@@ -101,16 +104,16 @@ class NormLiftQuery(CheckedOptions):
     segment_model: str | None = None
     """Weights of SAM 3: a folder in transformers format, or a model name to download. None: facebook/sam3."""
     segment_views: int = 8
-    """Maximum number of evenly spaced training views for --segment, at least 1. More views are slower and more
-    reliable."""
+    """Maximum number of training views for --segment, evenly spaced, at least 1. More views take longer and give more
+    reliable results."""
     objects: bool = False
     """List the objects in the selection, which are connected groups of at least 20 Gaussians. The column id is the
     instance_id in exports, and text is the prompt of the object. centroid is the mean position, weighted by evidence.
     box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z. Both span the
     1st to 99th percentile. R is the mean reliability. views counts the training images that show the object with at
     least a tenth of its largest visible area. best views has up to three of them. Images of the whole object come
-    first. Among these and among the others, images that show the object larger come first. If there are more than 40
-    objects, the table lists only the 10 largest, and a line below counts the objects of each prompt."""
+    first; within both groups, images in which the object appears larger come first. If there are more than 40 objects,
+    the table lists only the 10 largest, and a line below counts the objects of each prompt."""
     objects_dir: Path | None = None
     """Folder for the list of --objects or --inventory in capture and scene coordinates, with the axes of the boxes. The
     files are objects.json and objects.csv, and objects.ply and objects_scene.ply with the meshes of the boxes.
@@ -124,7 +127,7 @@ class NormLiftQuery(CheckedOptions):
     vocabulary: Path | None = None
     """Text file with names of objects for --inventory, one per line. None: the texts of the run's file of text
     embeddings, or else the words of the encoder: 1,000 classes for imagenet, and the names of colors for color. Other
-    encoders have no words, so objects are only numbered."""
+    built-in encoders have no words, so objects are only numbered."""
     image: Path | None = None
     """PNG file for --inventory: a render with the outlines, numbers and names of the objects. The camera is that of the
     training image that shows the most objects."""
@@ -133,7 +136,7 @@ class NormLiftQuery(CheckedOptions):
     data: Path | None = None
     """Current path of the dataset, if it was moved."""
     device: str = "auto"
-    """Device for the text encoder and the renders: auto, cpu or cuda."""
+    """Device for the text encoder and the renders: auto, cpu, cuda, or one GPU such as cuda:1."""
 
     def main(self) -> list[dict[str, Any]]:
         """Run the query, write files, print the table and return its rows; [] with --stdin or --interactive."""
@@ -160,7 +163,9 @@ class NormLiftQuery(CheckedOptions):
         save_renders = self._prepare_renders(result.question) if self.render_dir is not None else None
         rows = result.to_json()
         show_why = self._explain(result, rows) if self.explain else None
-        sam3_arrays, show_sam3 = self._segment(result, rows) if self.segment is not None else ({}, None)
+        sam3_arrays, show_sam3 = (
+            self._segment(result, rows, run.field.arrays["means"]) if self.segment is not None else ({}, None)
+        )
         show_objects = self._list_objects(result.question) if self.objects else None
         if self.output_json is not None:
             question = result.question
@@ -197,7 +202,7 @@ class NormLiftQuery(CheckedOptions):
 
     @cached_property
     def _prompts(self) -> tuple[str, ...]:
-        """Prompts of --text, split at commas."""
+        """Prompts in the texts of --text; see `split_texts`."""
         from normlift_ns.query.question import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
 
         return split_texts("--text", self.text)
@@ -236,9 +241,9 @@ class NormLiftQuery(CheckedOptions):
         return lambda: save_overlays(scene, result, cameras, folder, **shared)
 
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
-        """Add an explanation to every row, write the images, and return a function that prints the explanations.
+        """Add explanations to the rows, write the images, and return a function that prints the explanations.
 
-        Prompts that select nothing have no explanation.
+        The explanation is None for a prompt that selects nothing.
         """
         import torch  # noqa: PLC0415
 
@@ -251,9 +256,13 @@ class NormLiftQuery(CheckedOptions):
             save_vote_images(votes, result.question.texts, reasons, self.explain_dir, overwrite=self.overwrite)
         return lambda: print_explanations(votes.names, result.question.texts, reasons, self.explain_dir)
 
-    def _segment(self, result: Answer, rows: list[dict[str, Any]]) -> tuple[dict[str, Any], Callable[[], None]]:
+    def _segment(
+        self, result: Answer, rows: list[dict[str, Any]], means: np.ndarray
+    ) -> tuple[dict[str, Any], Callable[[], None]]:
         """Segment training views with SAM 3 for the same prompts, lift the masks, and add their summary to every row.
 
+        Args:
+            means: Centers of the Gaussians for the summary, [N, 3].
         Returns:
             The arrays of the lifted masks, and a function that prints the summaries.
         """
@@ -280,7 +289,7 @@ class NormLiftQuery(CheckedOptions):
             settings=RasterSettings.recorded(run.field.manifest),
             device=device,
         )
-        summaries = segmented.summarize(run.scene.gaussians.means, torch.as_tensor(result.selected))
+        summaries = segmented.summarize(torch.from_numpy(means), torch.as_tensor(result.selected))
         for row, summary in zip(rows, summaries):
             row["segment"] = {"model": model, **summary}
         columns = {

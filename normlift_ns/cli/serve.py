@@ -33,7 +33,7 @@ class NormLiftServe(ServeOptions):
     this command, serve only these tools, on standard input and output. The page and the HTTP API are then not
     available. Needs pip install 'normlift-ns[mcp]'."""
     export_dir: Path | None = None
-    """Folder in which the tools of --mcp may write files. None: the tools write no files."""
+    """Folder in which the tools of --mcp may write files. None, or with --read-only True: the tools write no files."""
 
     def main(self) -> None:
         """Serve until the process is interrupted, or until the agent closes standard input."""

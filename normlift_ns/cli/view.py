@@ -28,17 +28,17 @@ class ServeOptions(CheckedOptions):
     """Address to listen on. 127.0.0.1: accept connections from this machine only. 0.0.0.0: also accept connections from
     other machines."""
     allowed_hosts: tuple[str, ...] = ()
-    """Further host names under which browsers may open the page, such as that of a proxy. The server answers requests
-    under other names with status 403."""
+    """Further host names under which browsers and programs may reach the server, such as that of a proxy. The server
+    answers requests under other names with status 403."""
     port: int = 7008
     """Port to listen on, in 1..65535. If it is in use, the server takes the first free one of the next 99 ports."""
     read_only: bool = False
-    """Prevent visitors from storing prompts in the run."""
+    """Prevent visitors from storing prompts in a run."""
     max_gaussians: int = 1_000_000
     """Maximum number of Gaussians that a browser renders. Larger scenes show only their most opaque and largest
     Gaussians. Larger values need more browser memory."""
     device: str = "auto"
-    """Device for the text encoder: auto, cpu or cuda."""
+    """Device for the text encoder: auto, cpu, cuda, or one GPU such as cuda:1."""
 
     def check(self) -> None:
         """Raise InputError if the server cannot listen at the address, or an option is not valid."""

@@ -164,7 +164,7 @@ class NormLiftWeights(CheckedOptions):
     """Names of weights to fetch. imagenet and edges come from the Python indexes that pip and uv are configured for,
     and all others from the Hugging Face hub."""
     output_json: Path | None = None
-    """JSON file for the table, in addition to the printed table."""
+    """JSON file for the table. With --get, it is written after the downloads."""
     overwrite: bool = False
     """Replace an existing JSON file."""
 

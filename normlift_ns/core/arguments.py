@@ -194,8 +194,8 @@ def _check_any(checks: Sequence[_Check], optional: bool, name: str, value: Any, 
 def _list_check(origin: type, hint: Any) -> _Check:
     """Return the check for a sequence or an iterable.
 
-    Items of lists, tuples and ranges are checked immediately. Items of other sequences are not checked, and those of
-    other iterables are checked lazily.
+    Items of lists, tuples and ranges are checked immediately. Items of other values are not checked if the annotation
+    is a Sequence, else they are checked lazily.
     """
     item = _check_of(hint)
 
@@ -235,7 +235,7 @@ def _mapping_check(item: _Check) -> _Check:
 
 
 def _function_check(parts: Sequence[Any]) -> _Check:
-    """Return the check for a function argument. Arrays that the function returns are checked too."""
+    """Return the check for a function argument: its number of parameters and, at every call, arrays that it returns."""
     arguments, result = [_check_of(hint) for hint in parts[0]], _check_of(parts[1])
 
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
@@ -269,7 +269,7 @@ class _ArrayCheck:
         self.to_numpy, self.numpy = hint.array_type is np.ndarray, hint.array_type in (np.ndarray, Any)
 
     def __call__(self, name: str, value: Any, sizes: _Sizes) -> Any:
-        """Return the value as a tensor, or as a NumPy array if the annotation requires one."""
+        """Return the value as a tensor, or as a NumPy array if the annotation requires one, or accepts a given one."""
         value = value if self.numpy and isinstance(value, np.ndarray) else self._convert(name, value)
         shape, more = tuple(value.shape), len(value.shape) - len(self.axes)
         if _kind_of(value.dtype) not in self.kinds or (more < -1 if self.wide else more != 0):
@@ -313,7 +313,7 @@ def _layout(value: Any) -> str | None:
 
 
 def as_tensor(name: str, value: Any, expected: str) -> Any:
-    """Convert a NumPy array or nested lists to a tensor, or raise ArgumentError with `expected` in the message."""
+    """Return a tensor, array or nested list as a tensor, or raise ArgumentError with `expected` in the message."""
     if not isinstance(value, np.ndarray | list | tuple):
         if (layout := _layout(value)) is None:
             raise _error(name, expected, value)

@@ -2,7 +2,7 @@
 
 An error in a 2D feature affects its whole region in one view, so neighboring Gaussians share it. Regions of other views
 that cover the same Gaussians usually do not have this error. The consensus therefore moves each feature toward those of
-overlapping regions in other views. Let E be the evidence, F_s the feature of region s, and W_jv(s) the weight of
+overlapping regions in other views. Let E be the evidence and F_s the feature of region s. Let W_jv(s) be the weight of
 Gaussian j in the view of s, including pixels without a region. Let t be a region of another view v. Sums over j run
 over the Gaussians that are visible in both views::
 
@@ -193,8 +193,8 @@ def with_original_reliability(scalars: Scalars, original: Scalars) -> Scalars:
 def apply_consensus(
     features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0, least: float = CHANCE_AGREEMENT
 ) -> Float[Tensor, "s d"]:
-    """Return F', the features after the consensus, for the regions of one level. Regions without overlaps keep their
-    rows of F."""
+    """Return F', the features after the consensus, for the regions of one level. Regions without overlaps or without a
+    direction keep their rows of F."""
     strength = min(1.0, max(0.0, (overlaps.agreement - least) / AGREEMENT_RAMP))
     if strength == 0 or overlaps.iou.weight.numel() == 0:
         return features

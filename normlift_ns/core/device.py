@@ -29,7 +29,7 @@ Record = TypeVar("Record")
 
 
 class shared_property(cached_property[Result]):
-    """A `cached_property` that threads may request at the same time; the others wait for the first."""
+    """A `cached_property` for use by several threads. One thread computes the value, and the others wait for it."""
 
     def __init__(self, function: Callable[[Any], Result]) -> None:
         super().__init__(function)
@@ -92,7 +92,7 @@ def retry_in_halves(run: Callable[[Items], Result], items: Items, advice: str) -
 
 
 def init_cuda(device: str) -> None:
-    """Initialize CUDA and Triton in background threads, because both take about a second.
+    """Initialize CUDA and Triton in background threads if the device is a GPU. Both take about a second.
 
     Errors are ignored here. They occur again at the first use of the GPU.
     """
@@ -209,7 +209,7 @@ class AdaptiveBatches:
         """Yield the result rows of each part, one row per item. A batch may contain items of several parts.
 
         The last batch is padded with copies of its last item. All batches therefore have the same shape, unless the
-        batch size is reduced, and the other items of a batch change a row only by rounding.
+        batch size is reduced. The result row of an item depends on the other items of its batch only by rounding.
 
         The next part is requested when a batch has room for more items. The rows of a part are yielded together, after
         all of them are computed.

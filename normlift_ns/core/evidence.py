@@ -163,7 +163,7 @@ class Evidence(TensorRecord):
 
     @check_arguments
     def columns_of(self, views: Sequence[int] | Int[Tensor, " m"]) -> Int64[Tensor, " columns"]:
-        """Return the columns of the given views, in their order.
+        """Return the columns of the given views, in the order of `views`.
 
         `features[evidence.columns_of(v)]` is the feature table of `evidence.select_views(v)`.
 
@@ -376,7 +376,7 @@ def _join_by_sorting(
 ) -> tuple[SparseRows, SparseRows]:
     """Compute the result of `_join` with one stable sort, which is faster on a GPU.
 
-    Entries of unlabeled pixels are sorted behind all entries of regions.
+    Entries of unlabeled pixels are sorted after all entries of regions.
     """
     is_region, new = _column_table([count for part in parts for count in part.num_regions], 0, 0)
     code = torch.where(is_region, new, -1 - new).to(device)  # index of the region, or -1 - view

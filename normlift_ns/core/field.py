@@ -394,7 +394,8 @@ _NULL_BLOCK = 32
 def with_null_level(field: SemanticField, vectors: Float[Tensor, "m d"]) -> SemanticField:
     """Return the field with null levels.
 
-    Its manifest records the top cosine of each null text, which is the 99.9 % quantile over the Gaussians.
+    Its manifest records the top cosines of the null texts in ascending order. A top cosine is the 99.9 % quantile over
+    the Gaussians that have a direction.
 
     Args:
         vectors: Vectors of any norm > 0, one for each of at least two texts of the null vocabulary.

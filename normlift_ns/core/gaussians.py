@@ -34,9 +34,10 @@ float32 number, and the rotation may become NaN or the identity."""
 class GaussianScene(TensorRecord):
     """N Gaussians with activated parameters, the input of the rasterizer.
 
-    Parameters may be NaN, infinite or too large, because training can produce such values. These Gaussians keep their
-    rows but are never drawn (see `drawable`), and `Evidence.num_excluded` counts them. They have no evidence, no
-    direction of their own and a reliability of 0. Exports omit those with parameters that are not finite.
+    Parameters may be NaN, infinite or out of range, because training can produce such values. Gaussians with such
+    parameters keep their rows but are never drawn (see `drawable`), and `Evidence.num_excluded` counts them. They have
+    no evidence, no direction of their own and a reliability of 0. Exports omit Gaussians with parameters that are not
+    finite.
 
     Raises:
         ValueError: If a shape, type or device is wrong, a scale is negative, or an opacity is outside 0..1.

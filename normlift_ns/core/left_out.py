@@ -5,10 +5,11 @@ halves are swapped. Let s be a region of a left-out view, and u_j the directions
 If the consensus is enabled, these directions follow a consensus among the kept views. J and F' are those of
 `core.consensus`, with b = 1 for F'::
 
-    U_s        = normalize(sum_j E_js u_j)                      feature of the region in the kept views
-    recognized = U_s is nearer to F_s than to all other regions of its view
-    confirmed  = sum_t J_st F_t over kept regions t with J_st > 0.3 is nearer to F_s than to all others of its view
-    agreement  = mean of <U_s, F'_s> over all regions, F'_s after a consensus among the left-out views alone
+    U_s        = normalize(sum_j E_js u_j)                      feature of s, predicted from the kept views
+    V_s        = sum_t J_st F_t                                 over the kept regions t with J_st > 0.3
+    recognized = U_s is nearer to F_s than to the feature of any other region of the same view and level
+    confirmed  = V_s is nearer to F_s than to the feature of any other region of the same view and level
+    agreement  = mean over all regions s of <U_s, F'_s>         F' from a consensus among the left-out views alone
 
 Recognition is measured for confirmed regions only. A region without a similar region in other views, such as a wrong or
 merged mask, should not be recognized. Regions without a feature, or whose Gaussians have no direction, do not count.
@@ -31,7 +32,7 @@ from normlift_ns.core.lift import lift
 from normlift_ns.core.sparse import CHUNK_ELEMENTS, SparseRows, row_offsets
 
 PARTNER_IOU = 0.3
-"""A kept region confirms a left-out region if J, their soft intersection over union, is above this value."""
+"""Value that J_st, the soft intersection over union, must exceed for a kept region t to count in V_s."""
 
 
 class LeftOut(NamedTuple):
@@ -42,8 +43,7 @@ class LeftOut(NamedTuple):
     confirmed: int
     """Number of left-out regions that overlapping kept regions confirm."""
     agreement: float
-    """Mean cosine between the feature of a left-out region in the kept views and its own feature after a consensus
-    among the left-out views; NaN without regions."""
+    """Mean of <U_s, F'_s> over the left-out regions s (see the module docstring); NaN without regions."""
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def _among(found: Overlaps, keep: Bool[Tensor, " s"]) -> Overlaps:
 
 
 def _partners(found: Overlaps, kept: Bool[Tensor, " s"], features: Float[Tensor, "s d"]) -> Float[Tensor, "s d"]:
-    """Return sum_t J_st F_t over the kept regions t with enough overlap."""
+    """Return V_s, the sum of J_st F_t over the kept regions t with J_st > `PARTNER_IOU`."""
     weight = torch.where(kept[found.iou.column.long()] & (found.iou.weight > PARTNER_IOU), found.iou.weight, 0.0)
     return replace(found.iou, weight=weight.to(features.dtype)).matmul(features)
 

@@ -46,7 +46,7 @@ class SpectralTable(NamedTuple):
 
 
 def spectral_table(features: Float[Tensor, "s d"], team: Communicator | None = None) -> SpectralTable:
-    """Compute the eigenvectors of the feature table in float64. All processes use the result of process 0."""
+    """Compute the eigenvectors and residuals in float64. All processes use the eigenvectors of process 0."""
     exact = features.double()
     vectors = torch.linalg.eigh(exact.T @ exact).eigenvectors.flip(1)
     vectors = vectors if team is None else team.broadcast(vectors)

@@ -133,7 +133,7 @@ def kendall_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
 
 
 def lowest_jaccard(a: Float[Tensor, " n"], b: Float[Tensor, " n"], share: float = 0.2) -> float:
-    """Return the Jaccard index of the two sets of points with the lowest `share` of values in each array.
+    """Return the Jaccard index of two sets of points: the fraction `share` with the lowest values in each array.
 
     Ties are ordered by index. Independent arrays give about share / (2 - share), for example 0.111 for 0.2.
     """
@@ -145,7 +145,7 @@ def lowest_jaccard(a: Float[Tensor, " n"], b: Float[Tensor, " n"], share: float 
 def bin_means(
     key: Float[Tensor, " n"], values: Float[Tensor, " n"], bins: int = 10
 ) -> tuple[Float64[Tensor, " bins"], Float64[Tensor, " bins"]]:
-    """Return the means of keys and values in bins by ascending key. Ties are ordered by index.
+    """Return the means of keys and values in bins of ascending keys. Ties are ordered by index.
 
     The numbers of points in two bins differ by at most 1.
 

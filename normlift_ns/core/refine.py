@@ -64,7 +64,7 @@ def refine(
     regions. If R_i = 0, S_ii is 0 too, and the best neighbor wins if its S_ij exceeds Delta.
 
     Args:
-        config: Options of the vote (default: the posterior vote with `own`, else the paper's vote).
+        config: Options of the vote (default: the posterior vote if `own` is given, else the paper's vote).
         directions: u, unit rows or 0 of any floating-point type. Float64 rows are used in float64, others in float32.
             If `directions` is a function of indices, such as `Lifted.directions`, only one block is in memory at a
             time.
@@ -200,9 +200,9 @@ def refine_subset(
 
 
 def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
-    """Resolve the options of a vote, and limit K to the number of other Gaussians and to `MAX_VOTERS`.
+    """Limit K to the number of other Gaussians and to `MAX_VOTERS`, and warn if this reduces K.
 
-    Warn if K is reduced.
+    Other options that are None, except tau and gamma, are set to the defaults of the kind of vote.
 
     >>> import warnings
     >>> with warnings.catch_warnings(record=True) as caught:
@@ -281,10 +281,11 @@ def posterior_weights(
     own: Float[Tensor, " n"],
     prior: float,
 ) -> Float64[Tensor, "m k_plus_1"]:
-    """Return own_i and P R_k d_ik / sum_k R_k d_ik of every neighbor, or 0 if it is missing or none is reliable.
+    """Return own_i, followed by P R_k d_ik / sum_k R_k d_ik of every neighbor k.
 
-    Squared distances are relative to that of the nearest reliable neighbor. This factor cancels, and it avoids
-    underflow.
+    The weight of a missing neighbor is 0, and so are all weights of neighbors if none is reliable. Squared distances
+    are relative to that of the nearest reliable neighbor. This multiplies every d_ik by the same factor, which cancels,
+    and avoids underflow.
     """
     r, square = _within(neighbors, width, rows, reliability)
     near = r[:, 1:] * _decay(r[:, 1:], square[:, 1:])
@@ -314,7 +315,7 @@ def _decay(r: Tensor, square: Tensor) -> Tensor:
 def _margin(
     neighbors: Neighbors, width: Tensor, rows: Int[Tensor, " m"], reliability: Tensor, delta: float
 ) -> Float64[Tensor, " m"] | float:
-    """Return Delta times the factor of `voting_weights`. If Delta > 0, it is infinite if no member is reliable."""
+    """Return Delta times the factor of `voting_weights`; infinity if Delta > 0 and no member is reliable."""
     if delta == 0:
         return 0.0
     return delta * torch.exp(0.5 * _nearest(*_within(neighbors, width, rows, reliability)).squeeze(1))
@@ -431,7 +432,8 @@ def shared_views(
 ) -> tuple[Float64[Tensor, " p"], Float64[Tensor, " p"]]:
     """Return the number of views in which two Gaussians share a region, and the number of views with regions of both.
 
-    If a Gaussian lies in several regions of a view, the probability that both lie in the same region counts.
+    A Gaussian may lie in several regions of a view. The first number then counts the view with the probability that
+    both Gaussians lie in the same region.
 
     Args:
         first, second, level: As in `shared_region_cosines`.

@@ -119,8 +119,8 @@ def relevancy(
             negative, in -2..2.
         temperature: Factor of the cosines inside the softmax, > 0.
     Raises:
-        ValueError: If a cosine is not in -1..1, `temperature` is out of range, the rule is unknown, or the rule needs
-            negatives and none are given.
+        ValueError: If a cosine is outside -1..1 by more than 0.01, `temperature` is out of range, the rule is unknown,
+            or the rule needs negatives and none are given.
 
     >>> import torch
     >>> from normlift_ns import relevancy
@@ -135,7 +135,7 @@ def relevancy(
 
 
 def _check_cosines(name: str, cosines: Any) -> None:
-    """Raise InputError if a value is not in -1..1, up to rounding."""
+    """Raise InputError if a value is outside -1..1 by more than 0.01."""
     if cosines is None or 0 in cosines.shape:
         return
     largest = float(abs(cosines).max())

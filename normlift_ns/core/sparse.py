@@ -15,8 +15,8 @@ from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.errors import InputError
 
 CANCELLATION_RATIO = 1e-3
-"""Vector sums shorter than this share of the sum of their weights are recomputed in float64, because float32 digits
-cancel."""
+"""Vector sums shorter than this share of the sum of their weights are recomputed in float64, because they lose digits
+by cancellation in float32."""
 MANY_ENTRIES = 4096
 """Sums of more vectors than this are computed in float64, because rounding errors of float32 would add up."""
 CHUNK_ELEMENTS = 2**24
@@ -69,8 +69,8 @@ class SparseRows(TensorRecord):
 
         In every row, the columns of a list must be larger than those of earlier lists.
 
-        The CPU does not sort, but writes every entry directly behind those of its row in earlier lists. On a GPU, a
-        single stable sort is faster if it fits into memory.
+        On the CPU, nothing is sorted. Each row receives its entries of the first list, then those of the second, and so
+        on. On a GPU, a single stable sort of all entries is faster. It is used if it fits into memory.
         """
         dtype = parts[0][2].dtype if parts else torch.float32
         parts = [part for part in parts if part[0].numel() > 0]

@@ -74,7 +74,7 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
     if len(models) == 0:
         raise FileNotFoundError(
             f"{folder} contains no COLMAP reconstruction: cameras.bin and cameras.txt are missing from it and from "
-            f"its {', '.join(_MODEL_FOLDERS)}. Give the folder that contains sparse/0 with --colmap."
+            f"its {', '.join(_MODEL_FOLDERS)}. With --colmap, give the folder that contains sparse/0."
         )
     if len(models) == 1:
         return models[0]
@@ -279,7 +279,7 @@ def _check_formats(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapI
     ]
     if len(differ) > 0:
         raise InputError(
-            f"{model} can be read in two ways: the cameras of {differ[0]} in the .bin and .txt files differ "
+            f"{model} is contradictory: the cameras of {differ[0]} in the .bin and .txt files differ "
             f"({len(differ)} of {len({**first, **second})} images). COLMAP and gsplat read the .bin files; nerfstudio "
             "reads the .txt files. Keep only those that the splat was trained with: "
             f"rm {model / '*.txt'}, or rm {model / '*.bin'}"

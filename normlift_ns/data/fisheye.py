@@ -131,7 +131,7 @@ def _sources(lens: Intrinsics) -> _Sources:
 
 
 def filled_pixels(lens: Intrinsics) -> Bool[np.ndarray, "h w"]:
-    """Return True at the pixels of the undistorted image that the original fisheye image shows."""
+    """Return a mask of the pixels of the undistorted image that the original fisheye image shows."""
     return _sources(lens).filled.copy()
 
 

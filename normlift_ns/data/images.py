@@ -95,8 +95,8 @@ def _matching(requested: str, names: Sequence[str]) -> list[str]:
     matches = [name for name in names if path.as_posix().endswith(f"/{name}")]
     if len(matches) != 1:
         raise InputError(
-            f"--eval-images {requested} does not match exactly one of the {len(names)} images. Give the name of an "
-            f"image, from {names[0]} to {names[-1]}."
+            f"--eval-images {requested} matches {len(matches) or 'none'} of the {len(names)} images, expected one. "
+            f"Give the name of an image, from {names[0]} to {names[-1]}."
         )
     return matches
 
@@ -298,8 +298,8 @@ class SplitViews:
 class ImageViews(SplitViews):
     """Lazy `Views` of the images in a camera file; each access reads and undistorts one image.
 
-    Images of perspective cameras are undistorted as in nerfstudio's FullImageDatamanager, so stock commands use the
-    same images. The camera matrix becomes OpenCV's optimal one without black borders, and images are cropped to its
+    Images of perspective cameras are undistorted as in nerfstudio's FullImageDatamanager, so nerfstudio's commands use
+    the same images. The camera matrix becomes OpenCV's optimal one without black borders, and images are cropped to its
     region of interest. Images of fisheye cameras keep their size, and at least 90 % of their pixels if a pinhole camera
     can show these (see `fisheye_pinhole`). Their masks are undistorted without interpolation, and are False at pixels
     that the original image does not show.

@@ -59,8 +59,8 @@ class SplatScene:
     remarks: tuple[str, ...] = ()
     """Warnings about the images, in whole sentences."""
     alignment: Alignment | None = None
-    """Agreement of renders by the rules of gsplat 1.4 with the images; None unless the search for the world found one
-    that fits."""
+    """Agreement of renders by the rules of gsplat 1.4 with the images; None unless the search for the world found a
+    world that fits."""
 
     renderer = None
     """Renderer of another package; None, because `normlift_ns` renders this scene."""

@@ -50,7 +50,7 @@ def open_splat(
         path: A plain or compressed PLY file, an SPZ, .splat, GLB or glTF file, or ckpt_<step>_rank<r>.pt of gsplat's
             simple_trainer. First bytes or suffix determine the format. Installed packages may add formats by suffix.
         options: Paths of the cameras and images, and settings of the splat.
-        device: Device of the renders that find the world: auto, cpu or cuda.
+        device: Device of the renders that find the world: auto, cpu, cuda, or one GPU such as cuda:1.
         say: Function that is called with a message for each assumption, for example `print`.
     Raises:
         FileNotFoundError: A file or image is missing.

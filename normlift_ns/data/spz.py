@@ -70,7 +70,7 @@ def encode_spz(
     Args:
         splat: Gaussians to encode.
         antialiased: True if they were trained with the rasterize mode "antialiased".
-        version: Version of the format. More programs read version 3; version 4 is newer.
+        version: Version of the format. More programs read version 3 than version 4.
         position_step: Round positions to larger steps of up to this length, which makes the file smaller.
     Raises:
         ValueError: A Gaussian that can be drawn is farther than 8,388,607 from the origin along an axis.
@@ -211,8 +211,10 @@ def _read_gzip(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
 def _read_zstd(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
     """Return the header and the attributes of version 4."""
     header = _read_header(data, path)
-    if header.version != 4 or len(data) < _TABLE_OFFSET.size:
-        raise _damaged(path, f"its uncompressed header has version {header.version}, expected 4, or is too short")
+    if header.version != 4:
+        raise _damaged(path, f"it is not compressed as a whole, as in version 4, but has version {header.version}")
+    if len(data) < _TABLE_OFFSET.size:
+        raise _damaged(path, f"it ends after {len(data)} of {_TABLE_OFFSET.size} header bytes")
     _check_size(header, len(data) * 64, path)  # zstd can reach a higher compression ratio than deflate
     (start,), number = _TABLE_OFFSET.unpack_from(data), data[_HEADER.size - 1]
     sizes = [size for size in header.sizes if size > 0]

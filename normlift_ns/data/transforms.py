@@ -365,7 +365,7 @@ def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrins
         name, first, second = differ[0]
         kept, others = (", ".join(dict.fromkeys(item[i][0] for item in differ)) for i in (1, 2))  # type: ignore[index]
         raise InputError(
-            f"{path} can be read in two ways. For {frame.file_path}, {name} is {first[1]:g} from {first[0]}, which "
+            f"{path} is contradictory. For {frame.file_path}, {name} is {first[1]:g} from {first[0]}, which "
             f"nerfstudio reads, and {second[1]:g} from {second[0]}, which programs such as instant-ngp and Brush read. "
             f"Remove the values that the splat was not trained with, and give new.json with --transforms: "
             f"jq 'del({others})' {path.name} > new.json, or jq 'del({kept})' {path.name} > new.json"
@@ -397,7 +397,7 @@ def _is_fisheye(entries: TransformsEntries, frame: FrameEntry, path: Path) -> bo
     models = [item.camera_model for item in (entries, frame) if item.camera_model is not None]
     if len(set(models)) > 1:
         raise InputError(
-            f"{path} can be read in two ways: the camera_model is {models[0]} for the file, but {frame.file_path} has "
+            f"{path} is contradictory: the camera_model is {models[0]} for the file, but {frame.file_path} has "
             f"{models[1]}. Remove the model that the splat was not trained with: jq 'del(.frames[].camera_model)' "
             f"{path.name} > new.json, or jq 'del(.camera_model)' {path.name} > new.json"
         )
@@ -405,7 +405,7 @@ def _is_fisheye(entries: TransformsEntries, frame: FrameEntry, path: Path) -> bo
     model = [*models, "OPENCV_FISHEYE" if is_fisheye else "OPENCV"][0].upper()
     if is_fisheye and model not in FISHEYE_MODELS:
         raise InputError(
-            f"{path} can be read in two ways: is_fisheye is true for {frame.file_path}, but its camera_model is "
+            f"{path} is contradictory: is_fisheye is true for {frame.file_path}, but its camera_model is "
             f"{model}. nerfstudio reads the camera_model. Set it to OPENCV_FISHEYE, or remove is_fisheye: "
             f"jq 'del(.is_fisheye, .frames[].is_fisheye)' {path.name} > new.json"
         )
@@ -650,7 +650,8 @@ def gsplat_normalization(frames: Sequence[Frame], points: Float[np.ndarray, "n 3
 
     The steps are those of gsplat 1.5, datasets/normalize.py and datasets/colmap.py. The first step makes the cameras
     upright, and places them around the origin at a median distance of 1. The second step rotates the principal axes of
-    the points to x, y and z, and turns the half with more points to the bottom.
+    the points to x, y and z, and turns the scene upside down if the median height of the points exceeds their mean
+    height.
 
     Args:
         frames: All registered images, sorted by name.

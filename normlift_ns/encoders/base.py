@@ -209,8 +209,8 @@ class RegionFeatures:
     regions: Regions
     encoder: Encoder
     filled: Callable[[str, int, int], Bool[Tensor, "h w"]] | None = None
-    """Function that returns True at pixels with a color, given the name, height and width of an image; None if all
-    pixels have a color. Other pixels do not belong to a region."""
+    """Function that returns a mask of the pixels with a color, given the name, height and width of an image; None if
+    all pixels have a color. Other pixels do not belong to a region."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -366,7 +366,7 @@ def _renumber(key: Int64[Tensor, "h w"], key_count: int) -> tuple[Int64[Tensor, 
     return number[key] - 1, int(number[-1])
 
 
-# Dense features without masks: each patch of a vision transformer is a region with its own feature.
+# Dense features without masks: each patch of a grid is a region with its own feature.
 
 
 class DenseEncoder(Encoder, Protocol):

@@ -228,9 +228,9 @@ def iter_medians(
 ) -> Iterator[tuple[Int[Tensor, " b"], Float[Tensor, "b d"]]]:
     """Yield (Gaussians, unit directions) as in VALA, block by block; Gaussians without evidence have the direction 0.
 
-    Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median of the features
-    of the other views by cosine distance. It is computed by Weiszfeld iterations with weights evidence / (1 - cosine),
-    renormalized to length 1.
+    Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median of the features of the
+    remaining views by cosine distance. It is computed by Weiszfeld iterations with weights evidence / (1 - cosine), and
+    is normalized to length 1 after each iteration.
 
     Args:
         gaussians: Gaussians to compute (default: all).

@@ -191,8 +191,8 @@ def weak_regions(
 ) -> tuple[list[WeakRegion], list[Int64[Tensor, " m"]]]:
     """Return regions of visible Gaussians with R_j(S) below a bound, and the Gaussians of each region.
 
-    Regions are sorted by sum_j s_j (min_reliability - R_j(S)), descending. Small regions are left out (see
-    `_MIN_SHARE`), and all after the first `_MAX_REGIONS`.
+    Regions are sorted by sum_j s_j (min_reliability - R_j(S)), descending. Regions with less than `_MIN_SHARE` of the
+    surface are left out, and so are all regions after the first `_MAX_REGIONS`.
     """
     surface = evidence.surface
     weak = visible(surface) & (evidence.reliability < min_reliability)

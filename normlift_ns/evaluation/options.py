@@ -70,7 +70,7 @@ class LerfOptions(CheckedOptions):
     pairs of frame and category. categories: average the frames of each category, then the categories."""
     clean: bool = False
     """Open and close each mask (morphology), keep its largest component and fill its holes, as in the code of Splat
-    Feature Solver. Pixels at the image border are lost. The paper does not specify this step."""
+    Feature Solver. The outermost rows and columns of the masks are then empty. The paper does not specify this step."""
     scale: Literal["unit", "norm"] = "unit"
     """Scores to composite. unit: cosines. norm: cosines times ||f||, the norm of the mean feature, as in Splat Feature
     Solver, which does not normalize features."""

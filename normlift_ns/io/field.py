@@ -124,7 +124,7 @@ def read_evidence(path: Path, *, key: str = "", remedy: str = "rasterize again")
         last = views - 1 if region_view.size > 0 else 0
         check_array("region_view", region_view, "int32", (region_view.size,), 0, last)
         if bool((region_view[1:] < region_view[:-1]).any()):
-            raise InputError(f"values of region_view decrease, expected ascending values in 0..{views - 1}")
+            raise InputError(f"values of region_view decrease, expected non-decreasing values in 0..{views - 1}")
         return EvidenceArrays(rows, region_view, unlabeled, (views, power, excluded), digest)
     except (KeyError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); {remedy}") from error

@@ -163,7 +163,7 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=Tru
     Args:
         path: Path of the output. If it does not exist, the function returns without a check.
         kind: Kind of the output, as `file_kind` returns it; None if it is not known yet.
-        flags: Flags for choosing the output, quoted in the error message.
+        flags: Options or arguments that named the output or allowed it to be overwritten, for the error message.
     Raises:
         ValueError: `path` is a folder, a pipe, a device or a broken link, cannot be read, or is of a different kind.
     """
@@ -176,9 +176,10 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=Tru
             f"{path}, given with {flags}, is not a regular file, or cannot be read; give another name"
         ) from None
     if found != "" and kind is not None and kind != found:
+        content = f"a {found} file" if found.startswith(".") else found
         raise InputError(
-            f"{path} contains {found}, but the output is {kind}, and --overwrite True replaces only files of the same "
-            "kind; give another name, or delete the file"
+            f"The content of {path} is {content}, but the output is a {kind} file, and only a file of the same kind "
+            "can be overwritten; give another name, or delete the file"
         )
 
 

@@ -392,7 +392,7 @@ def _sum_regions(
 
 @triton.jit(do_not_specialize=["base", "first_slot"])
 def _pack(key, weight, base, used, ends, out_key, out_weight, first_slot, COPIED: tl.constexpr):
-    """Move the used slots of a cell directly behind those of the previous cells."""
+    """Copy the used slots of a cell to the output, right after those of the previous cells."""
     cell = tl.program_id(0).to(tl.int64)
     count = tl.load(used + cell)
     source, target = tl.load(base + cell) - first_slot, tl.load(ends + cell) - count

@@ -3,7 +3,7 @@
 A warp searches for the neighbors of all points of a leaf together. It visits the tree from this leaf outward, and skips
 a subtree if its box is farther than the worst candidate of every point. It keeps a few more candidates than requested,
 by float32 distance, and finally ranks them by float64 distance and index. If a dropped point could be as near as the
-last neighbor, the row is reported as uncertain.
+last neighbor, the neighbors of the point are marked as uncertain.
 """
 
 from __future__ import annotations

@@ -55,7 +55,10 @@ def _world_axes(quats, scales, i, valid):
 
 @triton.jit
 def _rotated(camera, axis: tl.constexpr, ax, ay, az, bx, by, bz):
-    """Return one camera coordinate of two vectors. Each is summed in another order, as in gsplat."""
+    """Return one camera coordinate of the vectors (ax, ay, az) and (bx, by, bz).
+
+    As in gsplat, the terms of the first are added in the order x, y, z, and those of the second in the order y, x, z.
+    """
     a, b, c = tl.load(camera + 4 * axis), tl.load(camera + 4 * axis + 1), tl.load(camera + 4 * axis + 2)
     return tl.fma(c, az, tl.fma(b, ay, a * ax)), dot(a, b, c, bx, by, bz)
 

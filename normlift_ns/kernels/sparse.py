@@ -12,7 +12,7 @@ from torch import Tensor
 
 _ROWS = 128
 _VECTORS = 16
-"""Number of sums of vectors per program. With one, starting the programs takes as long as the sums."""
+"""Number of vector sums per program. With one sum per program, starting the programs takes as long as the sums."""
 
 
 class RowNorms(NamedTuple):

@@ -28,7 +28,7 @@ VotePrecision = Literal["certified", "first", "halves", "tf32", "tf32x3", "ieee"
 
 
 class LaunchConfig(NamedTuple):
-    """Launch parameters of one program."""
+    """Launch parameters of the kernel `_vote`."""
 
     columns: int
     """Number of columns of the rows that are loaded per step."""

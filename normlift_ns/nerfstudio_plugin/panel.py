@@ -254,7 +254,7 @@ def add_first_tab(gui: Any, label: str, icon: str) -> Any:
 
 
 _DELAY = 0.1
-"""Time in seconds after the last change of the state, after which objects and histograms are computed."""
+"""Seconds without a change of the state before objects and histograms are computed."""
 
 
 def explanation_of_run(folder: Path | None, field: SemanticField | None = None) -> Explanation:

@@ -122,7 +122,7 @@ class QuickRun:
     field: ArrayField
     """Semantic field, whose arrays include `means`, the centers of the Gaussians."""
     manifest: Mapping[str, Any]
-    """Manifest of the field, with the text encoder that the user chose."""
+    """Manifest of the field, changed by the arguments `text_embeddings` and `prompt_template` of `open_quick`."""
     device: str = "cpu"
     """Device for the network of the text encoder."""
 

@@ -147,7 +147,7 @@ class Answer:
         return {name: as_numpy(x) for name, x in (*arrays.items(), ("reliability", self.field.scalars.reliability))}
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Return the numbers of every prompt as plain Python types."""
+        """Return the result of `Finding.to_json` for every prompt."""
         on_gpu = not isinstance(self.relevancy, np.ndarray) and self.relevancy.is_cuda
         if on_gpu and len(self) >= _THREADS and bool(self.valid.any()):
             return self._summarize()
@@ -265,7 +265,7 @@ class Finding:
     def verdict(self) -> Verdict | None:
         """Presence of the prompt in the scene; None as in `query.threshold.judge`, or if no Gaussian has a direction.
 
-        For a prompt that selects Gaussians, a weak match replaces "probably not here".
+        For a prompt that selects Gaussians, "weak match" replaces "probably not here".
         """
         verdict = self.answer.verdicts[self.index]
         return "weak match" if verdict == "probably not here" and bool(self.mask.any()) else verdict
@@ -298,13 +298,13 @@ class Finding:
 
     @property
     def objects(self) -> list[SceneObject]:
-        """Objects of the selection, its connected components of at least 20 Gaussians, by descending size."""
+        """Objects of the selection, by descending size: its connected components of at least 20 Gaussians."""
         from normlift_ns.analysis.objects import find_objects  # noqa: PLC0415 (needs torch)
 
         return find_objects(self.answer.field, self.answer.means, self.mask).objects
 
     def to_json(self) -> dict[str, Any]:
-        """Return the numbers as plain Python types."""
+        """Return the prompt, its verdict, its numbers and its histogram as plain Python types."""
         names = ("text", "fraction", "centroid", "extent", "peak", "mean_reliability", "verdict", "nearest", "read_as")
         values = {name: getattr(self, name) for name in (*names, "suggested_threshold")}
         return {**values, "histogram": None if self.histogram is None else self.histogram.to_json()}

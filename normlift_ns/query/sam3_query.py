@@ -9,9 +9,9 @@ round, a view votes if the weighted intersection over union of its mask and the 
 exceeds one half. It also votes if both are empty. If SAM 3 found the prompt in none of these views, the result is that
 of the first round.
 
-All pixels of a view that does not vote are unlabeled. With `unlabeled="dilute"`, they lower the reliability of the
-Gaussians that they show. Agreement and reliability are those of `core.lift` for two regions per view, inside and
-outside, with the features (1, 0) and (0, 1).
+All pixels of a view that does not vote are unlabeled. The lift counts them with `unlabeled="dilute"`, so they lower
+the reliability of the Gaussians that they show. Agreement and reliability are those of `core.lift` for two regions per
+view, inside and outside, with the features (1, 0) and (0, 1).
 """
 
 from __future__ import annotations

@@ -114,7 +114,8 @@ def _histogram(values: Float64[np.ndarray, " n"], threshold: float, positions: t
 def picked_ranks(count: int) -> list[int]:
     """Return the ranks, in ascending order of relevancy, of the relevancies that `make_histograms` needs.
 
-    They are the smallest and the largest, u (see above), and those around the median and around the top.
+    They are the ranks of the smallest relevancy, the largest one and u, and those around the median and the top. Here,
+    u is the relevancy that 20 Gaussians exceed, or one in a thousand if these are fewer.
     """
     around = [min(int(share * (count - 1)) + i, count - 1) for share in (0.5, TOP_QUANTILE) for i in (0, 1)]
     return [0, count - 1, count - 1 - min(_SMALLEST_OBJECT, count // 1000), *around]
@@ -182,7 +183,7 @@ def draw_histogram(
 
 
 def suggested_range(field: HasManifest) -> tuple[float, float]:
-    """Return the lowest and highest f (see above) of a suggested threshold for the field's encoder."""
+    """Return the range of f, the position of a suggested threshold from m (0) to u (1), for the field's encoder."""
     kind = find_encoder_kind(encoder_name(field))
     return EncoderKind.suggested if kind is None else kind.suggested
 

@@ -30,12 +30,12 @@ _CHANNELS = 32
 _COMPILED = ("frustum_margin", "min_compensation", "max_alpha", "min_alpha", "min_transmittance")
 """Constants of gsplat's compiled code that must equal those of the scene."""
 _EXTENT = ("per_axis", "radius_sigmas", "min_discriminant")
-"""Further constants of the compiled code. They may differ from those of the scene if the scene uses the squares of
-gsplat 1.4 and a later version is installed, because `_squares` computes these."""
+"""Further constants of the compiled code, which usually must equal those of the scene too. They may differ if a later
+version than gsplat 1.4 is installed and the scene needs the squares of 1.4, because `_squares` computes the squares."""
 _LARGE = 100.0
 """Scale in world units below which no determinant overflows, for focal lengths below 400,000 pixels."""
 _OVERFLOWS = 1e10
-"""Lower bound of the radius in pixels if the determinant, of the order of (radius / 3) ** 4, overflows."""
+"""Radius in pixels below which no determinant overflows. A determinant is of the order of (radius / 3) ** 4."""
 _LONGEST_RADIUS = 2**31 - 128
 """Largest int32 number that float32 represents exactly."""
 

@@ -104,7 +104,7 @@ def _tiles(projected: AnyProjected, camera: Camera, settings: RasterSettings) ->
 
 
 _STRETCH = 0.1
-"""Fraction by which a covariance is enlarged, because a bounding ellipse has another center than the bounded one."""
+"""Fraction by which a covariance is enlarged, because the bounding and the projected ellipse have different centers."""
 
 
 def _bounding_ellipses(projected: ProjectedGaussians2D, min_alpha: float) -> Float[Tensor, "m 3"]:
@@ -204,7 +204,7 @@ def exp(x: float) -> float:
 
 @overload(exp, jit_options={"error_model": "numpy", "fastmath": {"contract"}})
 def _compiled_exp(x):  # pragma: no cover (compiled)
-    """Compute e ** x = 2 ** n e ** r with |r| <= ln(2) / 2, by the polynomial of Cephes' expf or a Taylor series."""
+    """Compute e ** x = 2 ** n e ** r with |r| <= ln(2) / 2, by the expf polynomial of Cephes or a Taylor series."""
 
     def single(x):
         x = x if x > _LEAST32 else _LEAST32

@@ -84,9 +84,9 @@ class ProjectedGaussians2D(NamedTuple):
     ) -> Float[Tensor, "h w k"]:
         """Return -log(alpha / opacity) of some Gaussians at the pixel centers (x, y); inf for planes seen edge-on.
 
-        This is half the smaller of two squared distances. The first is the distance in standard deviations from the
-        center to the point where the ray of the pixel meets the plane. The second is sqrt(2) times the distance from
-        `means2d` in pixels.
+        This is half the square of the smaller of two distances. The first is the distance in standard deviations from
+        the center to the point where the ray of the pixel meets the plane. The second is sqrt(2) times the distance of
+        the pixel from `means2d`, in pixels.
         """
         rows = self.transforms[members]
         across, down = x[:, None, None] * rows[:, 2] - rows[:, 0], y[:, None, None] * rows[:, 2] - rows[:, 1]

@@ -1,4 +1,4 @@
-"""Rasterization of evidence and images: backends and the choice of one, and compositing weights along a ray."""
+"""Rasterization of evidence and images, selection of backends, and compositing weights along a ray."""
 
 from __future__ import annotations
 
@@ -212,11 +212,11 @@ def rasterize_evidence(
         labels: One integer tensor [height, width] per view, with region ids 0, 1, … of this view. -1 means unlabeled.
             -2 means masked, and `lift` always ignores such pixels.
         num_regions: Number of regions per view (default: largest id + 1). Required if the feature table has rows for
-            regions without pixels.
+            regions above the largest id.
         backend: "torch" is the reference for any device and precision. "numba" is compiled for the CPU. "triton" is
             fast, for float32 on a GPU. "gsplat" is stock gsplat, for 3D Gaussians in float32 on a GPU, weight_power 1
-            and constants that the installed version supports. "auto" selects the fastest backend for the device and the
-            precision.
+            and constants that the installed version supports. "auto" selects the fastest backend for the device, the
+            precision, the kind of Gaussians and the weight power.
         progress: Callback after every view, with the number of finished views and the number of all views, or None if
             the latter is unknown.
         options: Keyword arguments of `RasterOptions`.
@@ -385,7 +385,9 @@ def render_with_image(
     mode: RasterizeMode | None = None,
     gaussians: GaussianScene | None = None,
 ) -> tuple[UInt8[Tensor, "h w 3"], Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """Return the results of `render_image`, on the CPU, and of `render`, in one pass over the Gaussians.
+    """Return the results of `render_image`, on the CPU, and of `render`.
+
+    Both are computed in one pass over the Gaussians, unless the scene has its own renderer.
 
     Args:
         values: Values per Gaussian, as in `render`, on the rendering device.
@@ -507,7 +509,8 @@ def contributors(
     """Return the Gaussians that contribute to pixels, with their compositing weights A_pj (eq. 1 of the paper).
 
     The weights are exact, because each pixel is rasterized as a region. The sum of A_pj over the pixels of a region is
-    therefore its evidence. The sum over j of A_pj times the values of the Gaussians is the result of `render`.
+    therefore its evidence for weight_power 1. The sum over j of A_pj times the values of the Gaussians is the result of
+    `render`.
 
     Args:
         scene: N Gaussians. Gaussians with invalid parameters (see `GaussianScene.drawable`) do not contribute.
@@ -588,9 +591,9 @@ def view_colors(
 
 
 def rotate_harmonics(coefficients: Float[Tensor, "n k 3"], rotation: Float64[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
-    """Return the spherical harmonics of colors that rotate with their Gaussians.
+    """Return the coefficients of the spherical harmonics after a rotation of the Gaussians and their colors.
 
-    Harmonics in many directions before and after the rotation determine its matrix by least squares.
+    The matrix that rotates coefficients is computed by least squares from harmonics in many directions.
 
     Args:
         coefficients: Coefficients of the spherical harmonics without the constant term, in gsplat's order.

@@ -446,8 +446,8 @@ def save_overlays(
 ) -> list[Path]:
     """Write one PNG figure per camera and prompt and, for several cameras, one contact sheet per prompt.
 
-    The figure of a camera shows the training image, if it can be read, next to a render with the relevancy and an
-    outline of the selection. All figures share one color scale.
+    The figure of a camera shows a render with the relevancy and an outline of the selection. If the training image can
+    be read, it is shown next to the render. All figures share one color scale.
 
     Args:
         cameras: Training cameras by file name prefix, as `training_cameras` returns them.
@@ -579,8 +579,9 @@ def save_inventory(
 ) -> str:
     """Write a PNG render of the scene with outlines, numbers and names of the objects of an inventory.
 
-    The camera is that of the training image that shows the most objects. If several images show as many, it is the one
-    in which the objects are largest on average, each as a fraction of its largest size in any image.
+    The camera is that of the training image that shows the most objects. Among images that show the same number, it is
+    the one with the largest mean size of the objects. Here, the size of an object is a fraction of its largest size in
+    any image.
 
     Args:
         path: File to write.

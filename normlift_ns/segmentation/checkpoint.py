@@ -390,7 +390,7 @@ def transformers_name(name: str) -> str:
 def config_from_weights(state: Mapping[str, Tensor]) -> Any:
     """Return the SamConfig of transformers for a file published by Meta, derived from the shapes of its parameters.
 
-    The shapes do not determine the number of heads (eight) of the mask decoder and the epsilon of its layer norms
+    The shapes determine neither the number of heads (eight) of the mask decoder nor the epsilon of its layer norms
     (1e-5). These values are the same in all of Meta's files.
     """
     shape = {name: tuple(value.shape) for name, value in state.items()}

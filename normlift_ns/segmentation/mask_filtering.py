@@ -174,7 +174,7 @@ class _Runs(NamedTuple):
     piece: Int64[Tensor, " n"]
     """Number of the component of each run. Large components may share a number."""
     area: Int64[Tensor, " n"]
-    """Number of pixels of the component that contains each run. It is exact only for small components."""
+    """Number of pixels of the component that contains each run. It is guaranteed exact only for small components."""
 
     def at(self, index: Tensor) -> _Runs:
         return _Runs(*(value[index] for value in self))

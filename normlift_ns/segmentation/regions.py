@@ -313,9 +313,8 @@ def _compact(values: np.ndarray, labeled: np.ndarray) -> Int32[Tensor, "h w"]:
 def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
     """Convert masks to a stack of label maps.
 
-    At each pixel, the first map has the index of the last mask that covers it, and each further map the index of the
-    previous one. Remaining entries are -1. The depth of the stack is the largest number of masks that share a pixel, at
-    least 1.
+    At each pixel, the maps have the indices of the masks that cover it, in descending order, followed by -1. The depth
+    of the stack is the largest number of masks that share a pixel, at least 1.
     """
     flat = masks.flatten(1)
     depth = max(1, int(flat.sum(dim=0).max()))
@@ -471,8 +470,9 @@ def _join_fragments(labels: Int32[np.ndarray, "h w"], smallest: float) -> Int32[
 
     Args:
         labels: Any labels. Two pieces with the same label become two regions.
-        smallest: Number of pixels below which a piece joins the neighbor with which it shares the longest boundary. A
-            piece that has only small neighbors joins one of them, once these have joined a larger one.
+        smallest: Number of pixels below which a piece is small. A small piece joins the region of a neighbor that is
+            not small or has already joined a region. Of several such neighbors, it is the one with the longest shared
+            boundary.
     """
     pieces, count = _connected_pieces(labels)
     size = np.bincount(pieces.ravel())

@@ -559,7 +559,7 @@ class MaskRules:
     crop_overlap: float = 512 / 1500
     """Overlap of neighboring crops, as a fraction of the shorter side of the image."""
     predicted_iou: float = 0.7
-    """Largest predicted IoU of masks that are dropped."""
+    """Predicted IoU up to which masks are dropped."""
     stability: float = 0.85
     """Smallest stability of masks that are kept."""
     stability_offset: float = 1.0
@@ -569,7 +569,7 @@ class MaskRules:
     box_iou: float = 0.7
     """Largest IoU of two boxes that are both kept."""
     region_area: int = 100
-    """Number of pixels below which holes and pieces are removed."""
+    """Number of pixels below which holes are filled and pieces are removed."""
     suppression: mask_filtering.Suppression = field(default_factory=mask_filtering.Suppression)
 
 
@@ -600,7 +600,7 @@ class _Candidates(NamedTuple):
 class SamMasks(RegionDefaults):
     """Regions from one level of SAM's automatic masks. Weights are loaded on first use.
 
-    The network segments one image at a time, while another thread prepares the maps of the image before.
+    The network segments one image at a time, while another thread prepares the maps of the previous image.
 
     Raises:
         ValueError: If transformers is not installed or too old, or the checkpoint is neither a path nor a hub name, or
@@ -625,7 +625,7 @@ class SamMasks(RegionDefaults):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """All settings that change the regions. Checkpoint files are identified by their content, not by their path."""
+        """All settings that change the label maps. Checkpoint files are identified by their content, not their path."""
         precision = resolve_precision(self.precision, self.device)
         return {"kind": "sam", "checkpoint": self._checkpoint, "precision": precision, "rules": asdict(self.rules)}
 

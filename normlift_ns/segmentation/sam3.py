@@ -33,7 +33,7 @@ from normlift_ns.segmentation.checkpoint import (
 from normlift_ns.segmentation.regions import RegionDefaults, stack_masks
 
 SCORE_THRESHOLD = 0.5
-"""Largest score of masks that are dropped, as in the model card.
+"""Score up to which masks are dropped, as in the model card.
 
 The score of a mask is the score of the instance times the presence score of the prompt.
 """

@@ -309,8 +309,10 @@ class WarmServer:
         return self.options.may_write(access)
 
     def offer(self, name: str, content: bytes) -> str:
-        """Store a file for download, and return its URL path; delete the oldest files above limits of number and
-        size."""
+        """Store a file for download, and return its URL path.
+
+        If the stored files exceed a limit on their number or total size, the oldest ones are deleted.
+        """
         key = secrets.token_urlsafe(16)
         self._downloads[key] = name, content
         while len(self._downloads) > 1 and (

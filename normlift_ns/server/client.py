@@ -339,7 +339,7 @@ class RemoteRun:
                     "with: ns-normlift-serve"
                 ) from error
         if status != 200:
-            raise InputError(f"The server at {self.address} rejected the request: {_reason(content)}")
+            raise InputError(f"The server at {self.address} answered with status {status}: {_reason(content)}")
         return content
 
     def _exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:

@@ -59,8 +59,8 @@ class Endpoint:
     work: Callable[[ServedRun, Any], Any]
     """Function of the run and the body, or of the run and the URL query; it returns JSON types or `Content`."""
     writes: bool = False
-    """True if the endpoint writes into the run. This needs the access token unless the server is local, and fails if it
-    is read-only."""
+    """True if the endpoint writes into the run. This needs the access token unless the server is local, and fails on a
+    read-only server."""
     parameters: tuple[str, ...] = ()
     """Names of the URL query parameters."""
     slow: bool = True

@@ -176,7 +176,7 @@ def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
 def _guarded(server: WarmServer, function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a coroutine function that calls `function` in a thread.
 
-    It raises ToolError for every error, with the message without absolute paths.
+    For every error, it raises ToolError with the message of the error, without absolute paths.
     """
 
     @wraps(function)

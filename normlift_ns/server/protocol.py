@@ -277,7 +277,7 @@ def legend(state: State) -> dict[str, Any] | None:
 def overlay_scale(state: State) -> tuple[float, float]:
     """Return the relevancies that get the weakest and the strongest color.
 
-    They are the threshold, and the best relevancy, limited to 1 and to at least 0.05 above the threshold.
+    The first is the threshold. The second is the best relevancy, at most 1, but at least 0.05 above the threshold.
     """
     assert state.answer is not None
     relevancy = _relevancy(state)[state.answer.valid]

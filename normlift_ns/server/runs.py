@@ -108,7 +108,7 @@ class ServedRun:
 
     @cached_property
     def visible(self) -> Bool[torch.Tensor, " n"]:
-        """Mask of the Gaussians that are opaque enough to be visible."""
+        """Mask of the Gaussians that can be drawn and are opaque enough to be visible."""
         gaussians = self.run.scene.gaussians
         return gaussians.drawable & (gaussians.opacities >= MIN_OPACITY)
 

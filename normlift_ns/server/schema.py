@@ -47,7 +47,7 @@ class QueryRequest(Question, frozen=True, forbid_unknown_fields=True):
 
 
 class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Selection of Gaussians by prompts, an object, a ray, a region or a mask, or of the likely floaters."""
+    """Selection of Gaussians by prompts, an object, a ray, a region or a mask. It can also be the likely floaters."""
 
     question: Question | None = None
     """Prompts that select Gaussians; None to select without prompts."""
@@ -100,7 +100,7 @@ class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     selection: Selection | None = None
     mode: ColorMode = "overlay"
     isolate: bool = False
-    """Draw only the selection."""
+    """Draw only the selection, in trained colors whatever the `mode` is."""
     max_size: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 800
 
 
@@ -181,7 +181,8 @@ class VoteResult(msgspec.Struct, frozen=True):
 
     name: str
     url: str | None
-    """Image with outlines of the regions that voted, as a data URL."""
+    """Image as a data URL; None if it cannot be read. It has outlines of the regions that voted, unless they cannot be
+    drawn (see `ExplainResult.problem`)."""
     regions: int
     share: float
     agreement: float

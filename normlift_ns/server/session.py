@@ -44,7 +44,8 @@ _GREETING_TIMEOUT = 20.0
 _SPOT = 0.3
 """Extent of the region around a position to look at, as a multiple of the scene's radius."""
 _SLIDERS = ("threshold", "reliability", "grow")
-"""Actions of sliders. Only the last waiting one is applied, and successive ones are merged in the history."""
+"""Actions of sliders. If several actions of one slider wait in succession, only the last is applied. Successive ones
+are merged into one step of the history."""
 
 T = TypeVar("T")
 

@@ -149,7 +149,7 @@ def unoccluded_viewpoint(
     """Return the first camera position with a clear view of an object, or the one with the least occlusion.
 
     The first candidate is on the current side of the object. The others are rotations of it around the vertical, first
-    at the current height, then from above. Occlusion is the mean over several Gaussians of the object; its own
+    at the current height, then at a greater height. Occlusion is the mean over several Gaussians of the object; its own
     Gaussians do not count as occluders.
 
     Args:

@@ -164,10 +164,12 @@ def merge_queries(stored: Query | None, asked: Query) -> Query:
     """
     if stored is None:
         return asked
-    if (stored.rule, stored.negatives, stored.refined) != (asked.rule, asked.negatives, asked.refined):
+    names = {"rule": f"rules {stored.rule} and {asked.rule}", "negatives": "negatives", "refined": "refined features"}
+    different = [name for field, name in names.items() if getattr(stored, field) != getattr(asked, field)]
+    if len(different) > 0:
         raise InputError(
-            f"The new prompts cannot be added to the stored ones, because they differ in rule ({asked.rule} and "
-            f"{stored.rule}), negatives or refinement. Replace the stored prompts, or ask again with the same settings."
+            "The new prompts cannot be added to the stored ones, which have different settings "
+            f"({', '.join(different)}). Replace the stored prompts, or ask again with the settings of the stored ones."
         )
     rows = {text: row for query in (stored, asked) for text, row in zip(query.texts, query.embeddings)}
     return replace(asked, texts=tuple(rows), embeddings=np.stack(list(rows.values())))

@@ -97,9 +97,10 @@ class SelectionContext:
         to the selection and similar to its mean direction. Their cosine is at least 0.95 for one step, and the limit
         decreases by 0.05 with each further step.
 
-        In each connected component, shrinking keeps the Gaussians whose graph distance to the middle of the component
-        is at most a fraction of the largest distance. The fraction is 10/11 for one step, and decreases by 1/11 with
-        each further step. More steps of growing never remove a Gaussian, and more steps of shrinking never add one.
+        In each connected component, shrinking keeps the Gaussians near the middle of the component. Their graph
+        distance to the middle is at most a fraction of the largest distance. The fraction is 10/11 for one step, and
+        decreases by 1/11 with each further step. More steps of growing never remove a Gaussian, and more steps of
+        shrinking never add one.
         """
         if steps == 0 or not bool(selected.any()):
             return selected

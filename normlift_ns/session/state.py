@@ -46,8 +46,8 @@ BY_HAND = "selected by hand"
 class State:
     """Immutable state of one user's view, without the camera; its masks are never modified.
 
-    The selection consists of the Gaussians that the prompts select, unless `prompts_select` is False, and of `added`,
-    without `removed`. It is then grown or shrunk by `grow_steps`.
+    The selection contains the Gaussians that the prompts select (none if `prompts_select` is False) and those in
+    `added`. Gaussians in `removed` are then left out. Finally, the selection is grown or shrunk by `grow_steps`.
     """
 
     space: SelectionContext

@@ -14,7 +14,7 @@ from normlift_ns.data.extra_images import add_extra_images
 from normlift_ns.data.frames import transform_frames
 from normlift_ns.data.splat import SplatParameters
 from normlift_ns.data.transforms import read_transforms, read_world_transform, write_transforms
-from normlift_ns.data.world_search import find_world
+from normlift_ns.data.world_search import _is_best_nearby, find_world
 from normlift_ns.data.worlds import with_opengl_axes
 from tests.captures import SHARED, capture, needs_shared
 from tests.data.scene_files import frames_of, in_world, ply_columns, write_ply
@@ -134,6 +134,16 @@ def test_other_rotations_are_not_taken(splat, transforms, tmp_path: Path, seed: 
     assert said == [] and scene.identity["source_world"]["name"] == "the world of its cameras"
     with pytest.raises(nl.InputError, match="does not match its images"):
         nl.lift_run(scene, output_dir=tmp_path / "out")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [-1, 0, 1])
+def test_a_world_that_a_small_turn_improves_is_not_the_best(splat, transforms, tmp_path: Path, degrees: int) -> None:
+    for axis in "xyz":
+        turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+        path = write_ply(tmp_path / f"{axis}.ply", ply_columns(in_world(splat, square(turn))))
+        scene = nl.open_splat(path, nl.SplatOptions(transforms=transforms, world_transform=None))
+        assert _is_best_nearby(scene, "cpu") == (degrees == 0), axis
 
 
 def test_a_given_world_or_none_is_not_searched(splat, transforms, tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_only_a_file_of_the_same_kind_is_replaced(kind: str, tmp_path: Path) -> 
             with atomic_file(path, overwrite=True) as draft:
                 draft.write_bytes(CONTENT[kind])
         else:
-            wrong = pytest.raises(InputError, match=rf"{name} contains .*same kind")
+            wrong = pytest.raises(InputError, match=rf"content of .*{name} is .*same kind")
             with wrong, atomic_file(path, overwrite=True) as draft:
                 draft.write_bytes(CONTENT[kind])
         assert path.read_bytes() == old and os.listdir(tmp_path) == [name], (kind, name)
@@ -86,7 +86,7 @@ def test_what_is_no_file_is_not_replaced_and_exports_change_together(tmp_path: P
     path.write_text("a diary")
     outside.write_text("{}")
     for files, gone in (((outside, path), []), ((outside,), [path])):
-        with pytest.raises(InputError, match="ns text,"), atomic_files(*files, overwrite=True, delete=gone) as drafts:
+        with pytest.raises(InputError, match="is text,"), atomic_files(*files, overwrite=True, delete=gone) as drafts:
             for draft in drafts:
                 draft.write_text('{"new": 1}')
         assert (outside.read_text(), path.read_text()) == ("{}", "a diary")

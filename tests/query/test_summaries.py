@@ -4,9 +4,10 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+import torch
 
 from normlift_ns import SemanticField
-from normlift_ns.query.engine import run_query
+from normlift_ns.query.engine import SelectionStats, run_query
 from normlift_ns.query.question import Query
 from tests.io.test_field import D, example
 from tests.random_scenes import unit_rows
@@ -33,3 +34,10 @@ def flat(value: Any, name: str = "") -> dict[str, Any]:
         return {name: value}
     parts = value.items() if isinstance(value, dict) else enumerate(value)
     return {key: entry for part, inner in parts for key, entry in flat(inner, f"{name}.{part}").items()}
+
+
+def test_selected_gaussians_without_evidence_count_equally():
+    means, mask = torch.tensor([[1.0, 0, 2], [5, 5, 5], [3, 2, 0]]), torch.tensor([True, False, True])
+    stats = SelectionStats.of(mask, means, torch.tensor([0.2, 0.9, 0.4]), torch.zeros(3))
+    assert stats.centroid == pytest.approx([2.0, 1.0, 1.0]) and stats.mean_reliability == pytest.approx(0.3)
+    assert stats.fraction == pytest.approx(2 / 3) and stats.extent == pytest.approx([1.8, 1.8, 1.8])

@@ -30,5 +30,6 @@ def test_colours_of_prompts_differ() -> None:
     assert float(apart[:20, :20].min()) > 0.24
     assert float(apart.min()) > 0.05
     assert prompt_colors([]).shape == (0, 3)
+    assert (prompt_colors(["fox"]) * 255).round().tolist() == [[230, 159, 0]]  # the first of Okabe and Ito
     mixed = prompt_colors(["red", "fox", "red shoes", "yellow", "lamp"])
     assert float((torch.cdist(mixed, mixed) + torch.eye(5) * 9).min()) > 0.24

@@ -11,8 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from scipy import ndimage
+from skimage.color import rgb2lab
 
-from normlift_ns.segmentation.regions import Grid, LabelFiles, Superpixels, read_image
+from normlift_ns.segmentation.regions import (
+    COMPACTNESS,
+    Grid,
+    LabelFiles,
+    Superpixels,
+    _join_fragments,
+    read_image,
+    superpixels,
+)
 from tests.encoders.tiny import noise, refused
 
 
@@ -30,6 +39,26 @@ def test_grid_cells_are_squares_of_one_size(height, width, count):
     assert (labels == labels[0, 0]).sum() == min(side, height) * min(side, width)
     assert int(labels.max()) + 1 == -(-height // side) * -(-width // side)
     assert Grid(2).labels(torch.zeros(2, 3, 3, dtype=torch.uint8), "").tolist() == [[[[0, 0, 1]] * 2]]
+
+
+def test_superpixels_are_the_nearest_centers_of_a_loop_in_float64():
+    height, width, side = 46, 61, (46 * 61 / 24) ** 0.5
+    image = np.array(Image.fromarray(noise(6, 7).numpy()).resize((width, height), Image.Resampling.BICUBIC))
+    y, x = np.mgrid[:height, :width]
+    rows, columns = round(height / side), round(width / side)
+    (row, v), (column, u) = divmod(y, -(-height // rows)), divmod(x, -(-width // columns))
+    points = np.dstack([rgb2lab(image) / COMPACTNESS, y / side, x / side])
+    labels, sampled = row * columns + column, (u % 2 == 0) & (v % 2 == 0)
+    for _ in range(6):
+        centers = np.full((rows * columns, 5), np.inf)
+        for cell in np.unique(labels[sampled]):
+            centers[cell] = points[sampled & (labels == cell)].mean(axis=0)
+        distance = np.square(points[:, :, None] - centers).sum(axis=3)
+        cells = np.arange(rows * columns)
+        far = np.maximum(abs(cells // columns - row[..., None]), abs(cells % columns - column[..., None])) > 1
+        labels = np.where(far, np.inf, distance).argmin(axis=2)
+    expected = _join_fragments(labels.astype(np.int32), 0.25 * side**2)
+    assert (superpixels(torch.from_numpy(image), 24) == expected).mean() > 0.998  # ties are broken by rounding
 
 
 def test_superpixels_keep_to_edges_also_of_tiny_images():

@@ -88,9 +88,12 @@ def test_saving_keeps_what_is_saved():
     assert (both.texts, both.threshold) == (("red", "blue", "green"), 0.7)
     np.testing.assert_array_equal(both.embeddings, np.eye(3))
     assert merge_queries(None, two) is two and prompts_of_query(None) == ()
-    for other in (posed("red", negatives=["green"]), posed("red", negatives=(), refined=False)):
-        with pytest.raises(InputError, match=f"{other.rule} and cosine"):
-            merge_queries(one, other)
+    for how, different in (
+        ((["green"], True), r"rules cosine and lerf, negatives\)"),
+        (((), False), r"\(refined features\)"),
+    ):
+        with pytest.raises(InputError, match=different):
+            merge_queries(one, posed("red", negatives=how[0], refined=how[1]))
     for folder, query, reason in ((None, one, "not stored"), (None, None, "no query")):
         with pytest.raises(InputError, match=reason):
             store_query(folder, query)

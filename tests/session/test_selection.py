@@ -44,6 +44,15 @@ def test_prompts_select_and_hides_add_up_over_questions():
             wrong()
 
 
+def test_layers_are_replaced_by_name_and_limited_in_number():
+    state = asked("red")
+    for number in (*range(actions.MAX_LAYERS), 5):
+        state = actions.add_layer(state, f"layer {number}")
+    assert len(state.layers) == actions.MAX_LAYERS and state.layers[-1].name == "layer 5"
+    with pytest.raises(InputError, match=str(actions.MAX_LAYERS)):
+        actions.add_layer(state, "one more")
+
+
 def test_a_click_selects_the_connected_object_adds_and_takes_away():
     state = asked("red")
     assert chosen(actions.click(state, ray(0)), 0)

@@ -35,6 +35,8 @@ def test_a_spot_fills_most_of_the_picture_from_the_side_where_the_camera_is_unle
     assert viewpoint(LookAtTarget((1.0, 0.0, 0.0), 2.0), (1.0, 0.0, 9.0), np.pi / 2) == pytest.approx((1, 0, 1.25))
     for sides in ((), ((0, 1, 0),), ((1, 0, 0), (-1, 0, 0), (0, 0, 1))):  # nothing in the way
         assert unoccluded_viewpoint(SPOT, walls(*sides), None, FROM, UP) == pytest.approx(seen), sides
+    raised = (3.0, -8.0, 6.0)
+    assert unoccluded_viewpoint(SPOT, walls(), None, raised, UP) == pytest.approx(viewpoint(SPOT, raised))
     scene = walls((0, -1, 0))
     hidden = torch.arange(len(scene)) == 0
     assert unoccluded_viewpoint(SPOT, scene, hidden, FROM, UP) == pytest.approx(seen)

@@ -27,7 +27,9 @@ CLASS_TARGETS: dict[type, str] = {}
 
 @dataclass_transform(field_specifiers=(field,))
 def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class]:
-    """Return a decorator that turns a class into a dataclass, and registers it as the mirror of the class of that name.
+    """Return a decorator that turns a class into a dataclass, and registers it as a mirror.
+
+    The mirrored class has the same name, and is in `module`.
 
     Args:
         module: Module of the mirrored class.

@@ -510,7 +510,9 @@ def _downscale_factor(
 
 def _blender(parser: config_classes.BlenderDataParserConfig) -> ParsedDataset:
     if parser.alpha_color is not None and parser.alpha_color.lower() not in config_classes.NAMED_COLORS:
-        raise InputError(f"alpha_color is {parser.alpha_color!r}, expected {', '.join(config_classes.NAMED_COLORS)}")
+        raise InputError(
+            f"alpha_color is {parser.alpha_color!r}, expected one of {', '.join(config_classes.NAMED_COLORS)}"
+        )
     train, held_out = (_blender_split(parser, split) for split in ("train", "test"))
     return ParsedDataset(train, held_out, torch.eye(4)[:3, :], parser.scale_factor)
 
