@@ -35,7 +35,7 @@ from normlift_ns.encoders.base import (
 from normlift_ns.encoders.cache import CachedRegions, cached
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_metadata
-from normlift_ns.options import BackendName, LiftOptions, RasterizeMode
+from normlift_ns.options import BackendName, LiftOptions, RasterizeMode, option_name
 from normlift_ns.rasterization.rasterize import rasterize_evidence, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.regions import LabelFiles
@@ -394,8 +394,8 @@ def _downscaled(view: View, divisor: int) -> View:
     height, width = camera.height // divisor, camera.width // divisor
     if min(height, width) < _MIN_SIDE:
         raise InputError(
-            f"lift_downscale {divisor:,} reduces {view.name} from {camera.width} x {camera.height} to {width} x "
-            f"{height} pixels; give a smaller number that leaves at least {_MIN_SIDE} pixels on each side"
+            f"{option_name('lift_downscale')} {divisor:,} reduces {view.name} from {camera.width} x {camera.height} "
+            f"to {width} x {height} pixels; give a smaller number that leaves at least {_MIN_SIDE} pixels on each side"
         )
     return view.downscaled(height, width)
 

@@ -60,7 +60,7 @@ def semantic_columns(field: SemanticField, answer: Answer | None, instances: Ins
     """
     if answer is not None and len(answer.relevancy) != len(field):
         raise InputError(
-            f"answer has {len(answer.relevancy):,} Gaussians, but the run has {len(field):,}; pass an answer from "
+            f"answer is for {len(answer.relevancy):,} Gaussians, but the run has {len(field):,}; pass an answer from "
             "this run"
         )
     scores = {"reliability": field.scalars.reliability, "n_eff": field.scalars.n_eff}
@@ -368,7 +368,8 @@ def read_cloud(path: Path) -> PlyData:
     """
     expected = "Expected a point cloud or mesh in PLY format whose vertices have x, y and z."
     if not path.is_file():
-        raise FileNotFoundError(f"{path}, the point cloud to label, does not exist. {expected}")
+        problem = "is not a regular file" if path.exists() else "does not exist"
+        raise FileNotFoundError(f"{path}, the point cloud to label, {problem}. {expected}")
     check_ply_header(path)
     try:
         cloud = PlyData.read(str(path), mmap="c")
@@ -527,7 +528,8 @@ def _export_masks(job: ExportJob, folder: Path) -> list[str]:
     assert job.answer is not None
     settings = RasterSettings.recorded(job.field.manifest)
     kwargs = {"invert": job.rest, "settings": settings, "overwrite": job.overwrite}
-    lines = [f"{len(write_masks(job.scene, job.answer.mask, folder, **kwargs))} masks in {folder}"]
+    count = len(write_masks(job.scene, job.answer.mask, folder, **kwargs))
+    lines = [f"{count} mask{'s' * (count != 1)} in {folder}"]
     with suppress(FileNotFoundError, InputError):  # the first image may be missing
         if job.scene.train[0].original is not None:
             lines.append(

@@ -119,6 +119,18 @@ def option_name(name: str) -> str:
     return f"--{VOTE_FLAGS.get(name, name).replace('_', '-')}" if _show_flags.get() else name
 
 
+def option_setting(name: str, value: object) -> str:
+    """Return an option with a value for a message: a keyword argument, or a flag inside `named_as_flags`.
+
+    >>> option_setting("device", "cpu")
+    "device='cpu'"
+    >>> with named_as_flags():
+    ...     option_setting("device", "cpu")
+    '--device cpu'
+    """
+    return f"{option_name(name)} {value}" if _show_flags.get() else f"{name}={value!r}"
+
+
 # Renamed options and keyword arguments. The old names work for one version, in Python and on the command line.
 
 
@@ -287,7 +299,9 @@ def check_device(device: Any) -> str:
     'cuda:0'
     """
     if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", str(device), re.ASCII):
-        raise InputError(f"--device must be auto, cpu or cuda, or a GPU such as cuda:1; got {short_repr(str(device))}")
+        raise InputError(
+            f"{option_name('device')} must be auto, cpu or cuda, or a GPU such as cuda:1; got {short_repr(str(device))}"
+        )
     return str(device)
 
 

@@ -316,7 +316,8 @@ def announce(prepared: PreparedLift) -> None:
     """Report the size of the lift, the automatic choice of 2D features, and the warnings about the scene."""
     request, scene, most, say = prepared.request, prepared.scene, prepared.lift.max_views, prepared.request.say
     used = "" if most is None else f"{min(most, len(scene.train))} of "
-    say(f"{len(scene.gaussians):,} Gaussians, {used}{len(scene.train)} training views, on {prepared.device}")
+    views = f"{used}{len(scene.train)} training view{'s' * (len(scene.train) != 1)}"
+    say(f"{len(scene.gaussians):,} Gaussians, {views}, on {prepared.device}")
     if request.features is None:
         choice = describe_choice(request.source or SourceOptions(), prepared.device)
         if choice is not None:
@@ -653,9 +654,9 @@ def check_directions(counts: Int64[Tensor, " 2"], total: int, source: FeatureSou
         )
     if lifted == 0:
         raise InputError(
-            f"none of the {total:,} Gaussians received a direction, although they have regions (from "
+            f"none of the {total:,} Gaussians received a direction, although some of them appear in regions (from "
             f"{_describe(source)}). Check whether the features cancel out in every Gaussian. If unlabeled pixels "
-            "outweigh them, give --unlabeled ignore"
+            "outweigh the regions, give --unlabeled ignore"
         )
     if lifted < _MIN_LIFTED_SHARE * total:
         warnings.warn(

@@ -408,7 +408,7 @@ def diagnose_device(device: str) -> Diagnostic:
         free, total = torch.cuda.mem_get_info(device)
         name = torch.cuda.get_device_name(device)
         return Diagnostic("device", "ok", f"{name}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free")
-    message = f"CPU, {torch.get_num_threads()} threads; no GPU is used"
+    message = f"CPU (threads: {torch.get_num_threads()}); no GPU is used"
     if torch.cuda.is_available():
         return Diagnostic("device", "warning", f"{message}, although one is available", "add --device cuda")
     return Diagnostic("device", "ok", message)

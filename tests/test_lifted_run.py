@@ -196,7 +196,7 @@ def test_what_cannot_be_lifted_is_named_and_leaves_nothing(scene: nl.Scene, tmp_
 
 
 def test_mistakes_are_named(trained: Path, lifted: Path) -> None:
-    with pytest.raises(FileExistsError, match="--timestamp"):
+    with pytest.raises(FileExistsError, match="another timestamp"):
         nl.lift_run(trained, source=nl.SourceOptions(encoder="color"), timestamp="one")
     with pytest.raises(TypeError, match=r"config_or_scene must be .* got 3"):
         nl.lift_run(3, features=[])  # type: ignore[arg-type]

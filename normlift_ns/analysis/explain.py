@@ -137,7 +137,7 @@ class Why:
         'The images agree (C_inter 0.97). Their weights are equivalent to 3.2 images of equal weight (N_eff).'
         """
         if len(self.views) == 0 and self.n_eff == 0:
-            return "The selection is outside the regions of all images."
+            return "No image shows the selection in its regions."
         if len(self.views) == 1:
             return "Only one image shows the selection in its regions, so no other image can confirm its features."
         level = next(words for least, words in _LEVELS if self.c_inter >= least)
@@ -346,8 +346,8 @@ class RecordedVotes:
         store = self.field.store
         if isinstance(store, StoredEvidence) and store.evidence.num_views != len(names):
             raise InputError(
-                f"the run lists {len(names)} images, but has evidence from {store.evidence.num_views} images; lift "
-                "again with: ns-normlift"
+                f"the run is damaged: number of lifted images {len(names)}, but number of images with evidence "
+                f"{store.evidence.num_views}; lift again with: ns-normlift"
             )
         return tuple(names)
 

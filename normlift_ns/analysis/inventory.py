@@ -80,7 +80,8 @@ class Inventory:
             ValueError: The inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
-            raise InputError(f"Object {number} does not exist. The inventory has {len(self)} objects, numbered from 1.")
+            count = f"{len(self)} object{'s' * (len(self) != 1)}"
+            raise InputError(f"Object {number} does not exist. The inventory has {count}, numbered from 1.")
         return self.instance_id == number
 
 
@@ -114,8 +115,8 @@ class Vocabulary:
         unknown = [word for word in words if kind is not None and not kind.known_words(word)]
         if len(unknown) > 0:
             raise InputError(
-                f"the encoder of the run cannot encode {len(unknown)} of the {len(words)} words of the vocabulary; "
-                f"remove them: {truncate_text(', '.join(unknown), 400)}"
+                f"the encoder of the run cannot encode some words of the vocabulary ({len(unknown)} of {len(words)}); "
+                f"remove or replace: {truncate_text(', '.join(unknown), 400)}"
             )
         return cls(words, kind, encode, ask)
 

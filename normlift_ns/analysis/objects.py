@@ -78,7 +78,10 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
         ValueError: `points` is empty or contains numbers that are not finite.
     """
     if len(points) == 0 or not np.isfinite(points).all():
-        raise InputError(f"a box needs one or more points, all finite; got {len(points)} points")
+        finite = int(np.isfinite(points).all(axis=1).sum())
+        raise InputError(
+            f"a box needs at least one point, and only finite points; got {len(points)} points, {finite} of them finite"
+        )
     axes = _axes(points[_central(points)])
     low, high = np.quantile(points @ axes.T, BOX_QUANTILES, axis=0)
     order = np.argsort(low - high, kind="stable")
@@ -693,7 +696,7 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
     """
     limit = check_number("floater_threshold", limit)
     if len(scalars.norm) != len(scene):
-        raise InputError(f"scalars has {len(scalars.norm):,} Gaussians, but the scene has {len(scene):,}")
+        raise InputError(f"scalars are for {len(scalars.norm):,} Gaussians, but the scene has {len(scene):,}")
     rows = (scene.drawable & (scene.opacities >= MIN_OPACITY)).nonzero().squeeze(1)
     score = torch.full((len(scene),), -torch.inf, device=scene.means.device)
     if len(rows) > 1:

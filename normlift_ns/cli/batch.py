@@ -163,7 +163,8 @@ def _make_capture(line: str, options: Sequence[str], common: NormLift, location:
         first, *rest = shlex.split(line)
     except ValueError as error:
         raise InputError(
-            f"{location}: {escape_unprintable(line)} is not quoted correctly ({error}). Close the quotes."
+            f"{location}: {escape_unprintable(line)} is not quoted correctly ({error}). Correct its quotes "
+            "and backslashes."
         ) from None
     source = None if first.startswith("--") else _SOURCES.get(Path(first).suffix.lower(), "load_config")
     own = [first, *rest] if source is None else [f"--{source.replace('_', '-')}", first, *rest]

@@ -84,7 +84,8 @@ class NormLiftCheck(NormLift):
         if opened is None:
             return rows, None
         scene = opened.scene
-        count = f"{len(scene.gaussians):,} Gaussians, {len(scene.train)} training views, {len(scene.held_out)} held out"
+        views = f"{len(scene.train)} training view{'s' * (len(scene.train) != 1)}"
+        count = f"{len(scene.gaussians):,} Gaussians, {views}, {len(scene.held_out)} held out"
         rows.append(Diagnostic("capture", "ok", count))
         rows += [Diagnostic("images", "warning", remark) for remark in scene.remarks]
         rows.append(planning.diagnose_views(scene))

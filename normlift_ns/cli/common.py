@@ -171,7 +171,7 @@ def _open_log(path: Path) -> IO[str]:
         refuse_inputs([path], instead="--log-file")
         arguments = [os.path.realpath(word.partition("=")[2] or word) for word in sys.argv[1:]]
         if arguments.count(os.path.realpath(path)) > 1:
-            raise InputError(f"{path}, given with --log-file, is also another argument; give another name")
+            raise InputError(f"{path}, given with --log-file, is also given as another argument; give another name")
         if path.exists():
             with open_regular(path) as file:
                 first = file.readline(2**16)

@@ -122,7 +122,8 @@ class NormLift(CheckedOptions):
             cores = os.cpu_count() or 1
             if self.num_devices > cores:
                 common.info(
-                    f"{self.num_devices} processes share {cores} CPU cores. More than {cores} processes are not faster."
+                    f"{self.num_devices} processes share {cores} CPU core{'s' * (cores != 1)}. More processes than "
+                    "cores do not make the lift faster."
                 )
             words = common.rename_flags(sys.argv[1:], common.renamed_flags(NormLift))  # prints once
             program = [sys.executable, "-m", "normlift_ns.cli.lift"]
@@ -260,7 +261,7 @@ class NormLift(CheckedOptions):
             return scene
         count = len(scene.train)
         scene = add_extra_images(scene, self.add_images)
-        common.info_progress(f"Added {len(scene.train) - count} new images from {self.add_images} to the lift.")
+        common.info_progress(f"New images from {self.add_images}, added to the lift: {len(scene.train) - count}.")
         return scene
 
 

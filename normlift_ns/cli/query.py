@@ -392,7 +392,8 @@ class NormLiftQuery(CheckedOptions):
         for name in ("save_query", "explain", "explain_dir", "segment", "objects", *_OUTPUTS):
             if flags != ["--text"] and getattr(self, name) and not (self.inventory and name == "output_json"):
                 flag = name.replace("_", "-")
-                raise InputError(f"--{flag} works only with --text; remove it, or give --text instead of {flags[0]}")
+                needed = "--text or --inventory" if name == "output_json" else "--text"
+                raise InputError(f"--{flag} works only with {needed}; remove it, or give --text instead of {flags[0]}")
         self._check_dependent_options()
         if self.interactive and not sys.stdin.isatty():
             raise InputError(

@@ -82,7 +82,7 @@ def _hub(
         except FileNotFoundError as error:
             page = f"https://huggingface.co/{repository}"
             raise FileNotFoundError(
-                f"{error}. Or download the weights from {page} on another machine: {local}"
+                f"{error}. Alternatively, download these files from {page} on another machine: {local}"
             ) from None
 
     return Weights(user, megabytes, license_name, data, repository, partial(hub_folder, repository), find, fetch)

@@ -91,7 +91,8 @@ def check_rows(name: str, rows: Any, size: int, low: int = 0) -> None:
         return
     first, last = map(int, rows.aminmax())
     if first < low or last >= size:
-        raise InputError(f"{name} must be in {low}..{size - 1}, got {first if first < low else last}")
+        expected = f"in {low}..{size - 1}" if size > low else "empty"
+        raise InputError(f"{name} must be {expected}, got {first if first < low else last}")
 
 
 class _Names(dict[str, Any]):
@@ -241,7 +242,8 @@ def _function_check(parts: Sequence[Any]) -> _Check:
         try:
             inspect.signature(value if callable(value) else lambda: 0).bind(*arguments)
         except TypeError:
-            raise _error(name, f"a function of {len(arguments)} arguments", value) from None
+            count = f"{len(arguments)} argument{'s' * (len(arguments) != 1)}"
+            raise _error(name, f"a function of {count}", value) from None
         except ValueError:  # some built-in functions have no signature
             pass
 

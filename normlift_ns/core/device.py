@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from normlift_ns.errors import InputError
-from normlift_ns.options import check_device
+from normlift_ns.options import check_device, option_setting
 
 MIN_TRITON_VERSION = 3
 Items = TypeVar("Items", Sequence, Tensor)  # pyright: ignore[reportMissingTypeArgument]
@@ -130,10 +130,11 @@ def choose_device(device: str) -> str:
     if device.startswith("cuda"):
         count = torch.cuda.device_count()
         if count == 0:
-            raise InputError(f"--device {device} needs a CUDA device, but PyTorch finds none; use --device cpu")
+            given, cpu = option_setting("device", device), option_setting("device", "cpu")
+            raise InputError(f"{given} needs a CUDA device, but PyTorch finds none; use {cpu}")
         if int(device[5:] or 0) >= count:
             existing = "cuda:0" if count == 1 else f"one of cuda:0 to cuda:{count - 1}"
-            raise InputError(f"--device {device} does not exist; use {existing}")
+            raise InputError(f"{option_setting('device', device)} does not exist; use {existing}")
     if device != "auto":
         return device
     return "cuda" if torch.cuda.is_available() else "cpu"

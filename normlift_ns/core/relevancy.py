@@ -141,8 +141,8 @@ def _check_cosines(name: str, cosines: Any) -> None:
     largest = float(abs(cosines).max())
     if not largest <= _LARGEST_COSINE:
         raise InputError(
-            f"{name} must be cosines in -1..1, got {largest:.6g}; for unit directions [N, D] and unit texts [Q, D], "
-            "pass directions @ texts.T, or use SemanticField.query"
+            f"{name} must be cosines in -1..1, got an absolute value of {largest:.6g}; for unit directions [N, D] "
+            "and unit texts [Q, D], pass directions @ texts.T, or use SemanticField.query"
         )
 
 

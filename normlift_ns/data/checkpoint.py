@@ -137,7 +137,7 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
         return checkpoints[max(checkpoints)]
     if step not in checkpoints:
         raise FileNotFoundError(
-            f"{folder} has no checkpoint of step {step}, only checkpoints of the steps "
+            f"{folder} has no checkpoint of step {step}. Available steps: "
             f"{', '.join(map(str, sorted(checkpoints)))}. Give one of these steps with --load-step, or omit "
             "--load-step to use the last one."
         )
@@ -256,10 +256,10 @@ def _check_archive(path: Path, advice: str) -> None:
             entries = archive.infolist()
             is_compressed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
             if is_compressed or sum(entry.file_size for entry in entries) > size:
-                raise InputError(
-                    f"{path} declares more content than its {size:,} bytes, or contains compressed entries, which "
-                    f"torch.save never writes. Copy it again, or {advice}."
+                problem = (
+                    "contains compressed entries" if is_compressed else f"declares more content than its {size:,} bytes"
                 )
+                raise InputError(f"{path} {problem}, unlike files of torch.save. Copy it again, or {advice}.")
             wrong = archive.testzip()
             damage = None if wrong is None else f"the checksum of {wrong} does not match its content"
     except InputError:
@@ -305,9 +305,10 @@ def check_dense_tensor(value: Tensor, name: str, path: Path) -> None:
         or value.is_nested
         or value.numel() * value.element_size() > value.untyped_storage().nbytes()
     ):
+        size = "" if value.layout != torch.strided else f" with {value.untyped_storage().nbytes():,} bytes of data"
         raise InputError(
-            f"{path}: {name} is a tensor of {value.dtype}, {value.layout}, {tuple(value.shape)} on {value.device}, "
-            "expected a dense array of real numbers. Save the file again with plain tensors."
+            f"{path}: {name} is a tensor of {value.dtype}, {value.layout}, {tuple(value.shape)} on "
+            f"{value.device}{size}, expected a dense array of real numbers. Save the file again with plain tensors."
         )
 
 
@@ -411,10 +412,11 @@ def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
         )
     missing = [name for name in _GSPLAT_NAMES if name not in splats]
     if missing or not all(isinstance(value, Tensor) for value in splats.values()):
+        problem = f"no {', '.join(missing)}" if missing else "values that are not tensors"
         raise InputError(
-            f"{path} has no {', '.join(missing) or 'tensors'} in `splats`, which contains "
-            f"{', '.join(sorted(map(str, splats)))}. Expected 3D Gaussians with spherical harmonics. Give a file of "
-            "gsplat's simple_trainer with --load-gsplat."
+            f"{path} has {problem} in `splats`, which contains "
+            f"{', '.join(sorted(map(str, splats))) or 'nothing'}. Expected 3D Gaussians with spherical harmonics. Give "
+            "a file of gsplat's simple_trainer with --load-gsplat."
         )
     return splats
 

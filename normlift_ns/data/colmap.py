@@ -320,7 +320,7 @@ def _read(
             data = _ByteReader(read_file(path, max_bytes=2**34))
             entries = list(parse_binary(data))
             if data.offset != len(data.data):
-                raise InputError(f"it has {len(data.data) - data.offset:,} bytes after its last entry")
+                raise InputError(f"it has data after its last entry (bytes: {len(data.data) - data.offset:,})")
             return entries
         lines = [line.strip() for line in read_file(path, max_bytes=2**34).decode("utf-8-sig").splitlines()]
         return list(parse_text([line for line in lines if not line.startswith("#")]))

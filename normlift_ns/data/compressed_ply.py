@@ -132,7 +132,7 @@ def _rounding(name: str, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3
     errors = means.amax(dim=1).sort().values / steps
     most = float(errors[(len(errors) * 99 - 1) // 100])
     return (
-        f"{name} contains rounded numbers. Maximum errors: {most:.2g} for 99 % of the positions and "
+        f"{name} contains rounded numbers. Maximum errors: {most:.2g} for 99% of the positions and "
         f"{float(errors[-1]):.2g} for all, {float(scales.max()) / steps:.2g} for logarithms of scales, "
         "0.005 radians for rotations, and 0.002 for opacities."
     )

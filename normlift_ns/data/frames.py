@@ -121,7 +121,7 @@ def image_warnings(files: Sequence[Path], headers: Sequence[ImageHeader]) -> tup
         if any(affected):
             first = files[affected.index(True)]
             count = f"{sum(affected)} of {len(files)}"
-            warnings.append(f"Some images {problem} ({count}, the first is {first}). {advice}.")
+            warnings.append(f"Some image files {problem} ({count}, the first is {first}). {advice}.")
     return tuple(warnings)
 
 

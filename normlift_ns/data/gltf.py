@@ -318,7 +318,9 @@ def _find_accessor(gltf: _Gltf, index: int, name: str, size: int) -> tuple[_Acce
         )
     kind = None if accessor is None else _TYPES.get(accessor.component_type)
     if accessor is None or kind is None or _SIZES.get(accessor.type) != size:
-        raise _damaged(gltf.path, f"{name} is not an accessor of {size} numbers")
+        raise _damaged(
+            gltf.path, f"the accessor of {name} is missing, or its type is not valid (numbers per row: {size})"
+        )
     return accessor, kind
 
 
@@ -327,10 +329,10 @@ def _view_bytes(gltf: _Gltf, index: object) -> tuple[_BufferView, memoryview]:
     views, buffers = gltf.document.buffer_views, gltf.buffers
     view = views[index] if isinstance(index, int) and 0 <= index < len(views) else None
     if view is None or not 0 <= view.buffer < len(buffers):
-        raise _damaged(gltf.path, f"it has no buffer view {str(index)[:20]}")
+        raise _damaged(gltf.path, f"its buffer view {str(index)[:20]}, or the buffer of this view, is missing")
     data = memoryview(buffers[view.buffer])
     if view.byte_offset < 0 or view.byte_length < 0 or view.byte_offset + view.byte_length > len(data):
-        raise _damaged(gltf.path, f"a buffer view is larger than its buffer of {len(data):,} bytes")
+        raise _damaged(gltf.path, f"a buffer view extends beyond its buffer of {len(data):,} bytes")
     return view, data[view.byte_offset : view.byte_offset + view.byte_length]
 
 

@@ -270,7 +270,7 @@ def read_ply(path: Path) -> SplatFile:
         splat, mode = _apply_filter(splat, widths, path), mode or "antialiased"
         remarks += (
             f"{path.name} has filter_3D, the 3D filter of Mip-Splatting, which is applied to scales and opacities. The "
-            "2D filter of Mip-Splatting has 0.1 square pixels; the rasterize mode antialiased uses 0.3 instead.",
+            "2D filter of Mip-Splatting has a variance of 0.1 square pixels; the rasterize mode antialiased uses 0.3.",
         )
     validate_splat(splat, path)
     return SplatFile(splat, mode, primitive="2dgs" if is_2d else None, remarks=remarks)

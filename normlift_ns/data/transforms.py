@@ -118,7 +118,8 @@ def read_json_file(path: Path, expected: str) -> Any:
         ValueError: The file is too large, is not valid JSON, or is nested too deeply.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"The file {path} does not exist. Expected {expected}.")
+        problem = "is not a regular file" if path.exists() else "does not exist"
+        raise FileNotFoundError(f"{path} {problem}. Expected {expected}.")
     if path.stat().st_size > _MAX_JSON_BYTES:
         raise InputError(
             f"{path} has {path.stat().st_size:,} bytes, expected at most {_MAX_JSON_BYTES:,}. Give {expected}."
@@ -151,12 +152,11 @@ def read_transforms_entries(path: Path) -> TransformsEntries:
     _check_numbers(entries, str(path))
     for frame in entries.frames:
         _check_numbers(frame, f"{path}: {frame.file_path}")
-        names = (frame.file_path, frame.mask_path or "-")
-        if (invalid := next((name for name in names if name.strip() == "" or "\0" in name), None)) is not None:
-            raise InputError(
-                f"{path} has the file_path or mask_path {invalid!r}, which is not a valid file name. Correct the entry "
-                "of this frame."
-            )
+        for key, name in (("file_path", frame.file_path), ("mask_path", frame.mask_path or "-")):
+            if name.strip() == "" or "\0" in name:
+                raise InputError(
+                    f"{path} has the {key} {name!r}, which is not a valid file name. Correct the entry of this frame."
+                )
         if not _is_matrix(frame.transform_matrix):
             raise InputError(
                 f"{path}: the transform_matrix of {frame.file_path} is not valid. Expected a camera-to-world matrix of "
@@ -487,10 +487,9 @@ def _applied_transform(entries: TransformsEntries, path: Path) -> Float[np.ndarr
             raise InputError(f"{path}: applied_transform is not valid, expected 3 x 4 finite numbers.")
         matrix[:3] = rows[:3]
     if abs(np.linalg.det(matrix)) < _MIN_DETERMINANT or not 0 < entries.applied_scale < math.inf:
-        raise InputError(
-            f"{path}: applied_transform cannot be inverted, or applied_scale is {entries.applied_scale}. Expected an "
-            "invertible transform and a positive scale."
-        )
+        is_singular = abs(np.linalg.det(matrix)) < _MIN_DETERMINANT
+        problem = "applied_transform cannot be inverted" if is_singular else f"applied_scale is {entries.applied_scale}"
+        raise InputError(f"{path}: {problem}. Expected an invertible transform and a positive scale.")
     return matrix
 
 
@@ -548,9 +547,10 @@ def _to_world(values: Any, path: Path, expected: str = _EXPECTED_DATAPARSER) -> 
         raise InputError(f"{path} does not contain a transform ({error}). Expected {expected}.") from error
     rows = stored.transform
     if not _is_matrix(rows) or not 0 < stored.scale < _MAX_VALUE:
+        problem = f"its scale is {stored.scale:g}" if _is_matrix(rows) else "its matrix is not valid"
         raise InputError(
-            f"{path} does not contain a valid transform (rows: {len(rows)}, scale: {stored.scale:g}). Expected 3 rows "
-            f"of 4 finite numbers and a positive scale, as in {expected}."
+            f"{path} does not contain a valid transform: {problem}. Expected 3 rows of 4 finite numbers and a "
+            f"positive scale, as in {expected}."
         )
     return WorldTransform(np.array(rows[:3]), stored.scale)
 
@@ -631,7 +631,9 @@ def decompose_similarity(matrix: Float[np.ndarray, "4 4"], source: str) -> World
     if matrix.shape != (4, 4):
         raise InputError(f"{source} has the shape {matrix.shape}. Expected 4 x 4 numbers.")
     if not (np.abs(matrix) < _MAX_VALUE).all():
-        raise InputError(f"{source} has numbers that are not finite. Expected 4 x 4 numbers between -1e30 and 1e30.")
+        raise InputError(
+            f"{source} has numbers that are not finite or are too large. Expected 4 x 4 numbers between -1e30 and 1e30."
+        )
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
     last = np.abs(matrix[3] - [0, 0, 0, 1]).max()

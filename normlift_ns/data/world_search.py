@@ -309,8 +309,8 @@ def find_world(
     fits = "; ".join(f"{world.name} ({other.psnr:.1f} dB)" for world, _, other in found)
     if len(found) > 1:
         say(
-            f"The splat fits its images in several worlds: {fits}. The first world, {here.name} ({match.psnr:.1f} "
-            "dB), is used. To use another world, give its transform as a file with --world-transform."
+            f"The splat fits its images in several worlds: {fits}. None of these is chosen; {here.name} "
+            f"({match.psnr:.1f} dB) is used. To use another world, give its transform as a file with --world-transform."
         )
         return scene
     _, other, other_match = found[0]

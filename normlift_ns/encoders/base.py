@@ -566,12 +566,13 @@ def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
         raise InputError(f"labels of {name} must be integers, got {labels.dtype}")
     labels, vectors = torch.from_numpy(labels.astype(np.int64)), _to_floats(pair[1])
     if vectors.ndim != 2 or vectors.shape[1] == 0 or not bool(vectors.isfinite().all()):
-        raise InputError(f"vectors of {name} must be finite and of shape [regions, D], got {vectors.shape}")
+        raise InputError(f"vectors of {name} must be finite and of shape [regions, D], got {_describe(vectors)}")
     low, high = (int(labels.min()), int(labels.max())) if labels.numel() > 0 else (0, 0)
     if labels.ndim != 2 or labels.numel() == 0 or low < -1 or high >= len(vectors):
+        values = f" with values in {low}..{high}" if labels.numel() > 0 else ", which is empty"
         raise InputError(
             f"labels of {name} must be an integer matrix with values in -1..{len(vectors) - 1}, got "
-            f"{tuple(labels.shape)} with values in {low}..{high}"
+            f"{tuple(labels.shape)}{values}"
         )
     return labels, vectors
 
@@ -586,13 +587,19 @@ def _convert_text(text: str, values: Any) -> Tensor:
     """Return the vector of a prompt as a tensor; raise InputError if the prompt or its vector is invalid."""
     vector = _to_floats(values)
     if vector.ndim != 1 or not bool(vector.isfinite().all()) or not bool(vector.any()):
-        raise InputError(f"the vector of prompt {text!r} must be finite, not zero and of shape [D], got {vector.shape}")
+        found = _describe(vector) if bool(vector.any()) else f"a zero vector of shape {tuple(vector.shape)}"
+        raise InputError(f"the vector of prompt {text!r} must be finite, not zero and of shape [D], got {found}")
     if text.strip() == "" or text.endswith(".npy") or re.search("[\0\ud800-\udfff]", text):
         raise InputError(
             f"{text!r} in texts is not a valid prompt, because it is empty, ends in .npy or contains invalid "
             "characters; use another prompt"
         )
     return vector
+
+
+def _describe(vectors: Tensor) -> str:
+    """Return the shape of an array for a message, and whether the array has values that are not finite."""
+    return f"{tuple(vectors.shape)}{'' if bool(vectors.isfinite().all()) else ' with values that are not finite'}"
 
 
 def _to_floats(values: Any) -> Tensor:

@@ -300,8 +300,10 @@ def _tokens(path: Path, family: ModelFamily) -> TokenPadding:
     pad = settings.get("pad_token") or family.pad_token
     pad = pad.get("content") if isinstance(pad, Mapping) else pad
     side = settings.get("padding_side", "right")
-    if not isinstance(pad, str) or side not in ("left", "right"):
-        raise InputError(f"{_TOKENIZER_CONFIG} has an invalid pad_token ({pad!r:.40}) or padding_side ({side!r:.40})")
+    if not isinstance(pad, str):
+        raise InputError(f"the pad_token of the tokenizer is {pad!r:.40}, expected a string")
+    if side not in ("left", "right"):
+        raise InputError(f"the padding_side of the tokenizer is {side!r:.40}, expected left or right")
     inputs = settings.get("model_input_names", ["input_ids"])
     return TokenPadding(pad, side, isinstance(inputs, list) and "attention_mask" in inputs)
 

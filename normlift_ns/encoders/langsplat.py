@@ -38,7 +38,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_npy
 from normlift_ns.io.atomic import atomic_file
 from normlift_ns.io.guard import check_files_distinct, read_file
-from normlift_ns.options import MissingFeatures
+from normlift_ns.options import MissingFeatures, option_setting
 from normlift_ns.segmentation.regions import resample_nearest
 
 LANGSPLAT_LEVELS = ("default", "s", "m", "l")
@@ -152,7 +152,8 @@ def write_npy(path: Path, array: np.ndarray, overwrite: bool) -> None:
             return
         if not overwrite:
             raise FileExistsError(
-                f"{path} exists with different content; export to another folder, or add --overwrite True"
+                f"{path} exists with different content; export to another folder, or give "
+                f"{option_setting('overwrite', True)}"
             )
     with atomic_file(path, overwrite=overwrite) as draft:
         draft.write_bytes(content)

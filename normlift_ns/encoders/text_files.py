@@ -69,7 +69,7 @@ def check_prompts(prompts: Sequence[str]) -> None:
     if isinstance(prompts, str):
         raise InputError(f"prompts must be a list of strings, got the single string {prompts!r}; write [{prompts!r}]")
     if len(prompts) == 0:
-        raise InputError('no prompt is given; name at least one object to search for, for example --text "orange"')
+        raise InputError('no prompt is given; name at least one object to search for, such as "orange"')
     for prompt in prompts:
         if not isinstance(prompt, str) or re.search("[\0\ud800-\udfff]", prompt):
             raise InputError(

@@ -661,7 +661,7 @@ def write_poses(
         for draft, content in zip(drafts, json_files.values()):
             draft.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf8")
         for i, (draft, pose, picture) in enumerate(zip(drafts[len(json_files) :], poses, pictures), 1):
-            save_pose_render(draft, f"pose {i}, shows region {', '.join(map(str, pose.regions))}", picture)
+            save_pose_render(draft, f"pose {i} (regions shown: {', '.join(map(str, pose.regions))})", picture)
     return written
 
 

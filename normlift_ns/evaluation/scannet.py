@@ -85,7 +85,7 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
             "*_vh_clean_2.labels.ply of the scene again"
         ) from error
     if not np.isin(labels, list(NYU40)).any():
-        raise InputError(f"{path} has no label to score, expected NYU40 ids such as {', '.join(map(str, NYU40))}")
+        raise InputError(f"{path} has no label to score, expected some of the NYU40 ids {', '.join(map(str, NYU40))}")
     unknown = (labels > _LAST_ID) | (labels < -1)
     if unknown.any():
         warnings.warn(

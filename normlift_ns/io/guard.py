@@ -120,10 +120,7 @@ def refuse_inputs(paths: Iterable[Path], *, instead: str = "path") -> None:
     for path in paths:
         owner = _owner_of(os.path.realpath(path), owners, inputs)
         if owner is not None:
-            raise InputError(
-                f"{path} is part of {owner} and must not be replaced, not even with --overwrite True; "
-                f"give another {instead}"
-            )
+            raise InputError(f"{path} is part of {owner}, so it cannot be an output; give another {instead}")
 
 
 def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callable[[], Mapping[Any, str]]) -> str | None:

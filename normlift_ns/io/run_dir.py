@@ -22,7 +22,7 @@ from normlift_ns.io.atomic import (
     write_text_file,
 )
 from normlift_ns.io.guard import open_regular, read_file, read_text, refuse_inputs
-from normlift_ns.options import LiftOptions, SourceOptions, Storage, new_names
+from normlift_ns.options import LiftOptions, SourceOptions, Storage, new_names, option_name, option_setting
 
 FIELD_FOLDER = "normlift"
 """Name of the folder of the semantic field in the run directory."""
@@ -64,8 +64,8 @@ def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> 
             raise InputError(f"the {kind} must be a string, got {folder!r:.60}")
         if folder.startswith(".") or folder.strip() == "" or {"/", "\\"} & set(folder) or not folder.isprintable():
             raise InputError(
-                f"the {kind} {folder!r} is not a valid folder name; give a name that does not start with a dot and has "
-                "no slashes, such as 'run'"
+                f"the {kind} {folder!r} is not a valid folder name; give a printable name without slashes and "
+                "without a dot at the start, such as 'run'"
             )
         if len(os.fsencode(folder)) > _MAX_NAME_BYTES:
             raise InputError(
@@ -174,18 +174,18 @@ def refuse_existing_run(run_dir: Path, overwrite: bool, source: Path | None = No
         FileExistsError: The directory exists, and `overwrite` is False or the directory is not a lifted run.
         ValueError: `source` is in the directory, or the errors of `refuse_inputs`.
     """
-    flags = "--timestamp or --output-dir"
+    flags = f"{option_name('timestamp')} or {option_name('output_dir')}"
     refuse_inputs([run_dir], instead=flags)
     complete_interrupted_writes(run_dir.parent)
     if source is not None and Path(os.path.realpath(source)).is_relative_to(os.path.realpath(run_dir)):
         raise InputError(f"{run_dir} contains the run to lift, so the lift must not replace it; give another {flags}")
     if not overwrite and os.path.lexists(run_dir):
-        raise FileExistsError(f"{run_dir} exists; give another {flags}, or --overwrite True.")
+        raise FileExistsError(f"{run_dir} exists; give another {flags}, or {option_setting('overwrite', True)}.")
     is_run = (run_dir / "config.yml").is_file() and (run_dir / FIELD_FOLDER).is_dir()
     if os.path.lexists(run_dir) and not is_run:
         raise FileExistsError(
-            f"{run_dir} has no config.yml or no {FIELD_FOLDER}/, but --overwrite replaces only lifted runs; "
-            "give another --timestamp or --output-dir, or delete the folder"
+            f"{run_dir} has no config.yml or no {FIELD_FOLDER}/, but only lifted runs can be replaced; give another "
+            f"{flags}, or delete the folder"
         )
 
 

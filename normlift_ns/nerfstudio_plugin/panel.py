@@ -415,7 +415,7 @@ class SearchPanel(Controller):
             raise InputError("Nothing is selected. Select Gaussians before you download them.")
         file_name, content, count = splat_bytes(self._host.splat_parameters(), self.history.now, mask, name)
         client.send_file_download(file_name, content)
-        self.show_message(f"Sent {file_name} with {count:,} Gaussians to the browser.")
+        self.show_message(f"Sent {file_name} to the browser. Gaussians: {count:,}.")
 
     def _ask(self) -> None:
         if self._widgets is not None:

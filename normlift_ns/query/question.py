@@ -283,10 +283,8 @@ def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
         )
     negative = arrays.get("negative_vectors")
     if (negative is None) != (len(metadata.negatives) == 0):
-        raise InputError(
-            f"it names {len(metadata.negatives)} negatives, but has {'no' if negative is None else 'an'} array "
-            "negative_vectors"
-        )
+        found = "no array" if negative is None else "an array"
+        raise InputError(f"its number of negatives is {len(metadata.negatives)}, but it has {found} negative_vectors")
     if RELEVANCY_RULES[metadata.rule].needs_negatives and negative is None:
         raise InputError(f"the rule {metadata.rule!r} needs negatives, but the file has none")
     size = arrays["vectors"].shape[-1] if arrays["vectors"].ndim > 0 else 0

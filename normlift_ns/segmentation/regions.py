@@ -276,7 +276,7 @@ class LabelFiles(RegionDefaults):
                 "it as an 8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
         if maps.dtype.kind not in "iub":
-            raise InputError(f"{what} has type {maps.dtype}, expected an integer; save it with .astype(numpy.int32)")
+            raise InputError(f"{what} has type {maps.dtype}, expected integers; save it with .astype(numpy.int32)")
         if maps.ndim not in (2, 3) or maps.size == 0:
             raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps

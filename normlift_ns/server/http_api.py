@@ -191,7 +191,7 @@ def _number(name: str, text: str) -> float:
     except ValueError:
         value = float("nan")
     if not -1e15 < value < 1e15:
-        raise InputError(f"{name} must be a number, got {text[:40]!r}.")
+        raise InputError(f"{name} must be a number between -1e15 and 1e15, got {text[:40]!r}.")
     return value
 
 

@@ -212,7 +212,7 @@ def _data(url: str) -> bytes:
 def _text(content: Any) -> str:
     """Encode content as JSON with four significant digits, cut off after `_MAX_RESULT` characters."""
     text = msgspec.json.encode(_rounded(msgspec.to_builtins(content))).decode()
-    return text if len(text) <= _MAX_RESULT else text[:_MAX_RESULT] + " … (cut off; use fewer prompts)"
+    return text if len(text) <= _MAX_RESULT else text[:_MAX_RESULT] + f" … (cut off after {_MAX_RESULT:,} characters)"
 
 
 def _rounded(content: Any) -> Any:

@@ -304,7 +304,7 @@ class ServedRun:
         """
         if not 0 <= index < len(self.run.scene.train):
             raise InputError(
-                f"The run has no image {index}. It has {len(self.run.scene.train)} images, numbered from 0."
+                f"The run has no image {index}. Number of images: {len(self.run.scene.train)}, numbered from 0."
             )
         return to_jpeg(self.run.scene.train[index].image.cpu().numpy(), max_size)
 

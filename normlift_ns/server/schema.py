@@ -275,7 +275,8 @@ def find_object(state: State, number: int) -> ObjectRow:
     """
     objects = list_objects(state, max_objects=MAX_OBJECTS).objects
     if number > len(objects):
-        raise InputError(f"The list has no object {number}. It has {len(objects)} objects, numbered from 1.")
+        found = f"{len(objects)} object{'s' * (len(objects) != 1)}"
+        raise InputError(f"The list has no object {number}. It has {found}, numbered from 1.")
     return objects[number - 1]
 
 

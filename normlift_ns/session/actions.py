@@ -69,8 +69,14 @@ def _warning(finding: Finding) -> str:
         return read_as + f"{finding.text}: {finding.verdict}. The largest relevancy is {finding.peak:.2f}{position}."
     if finding.peak is None or bool(finding.mask.any()):
         return read_as.strip()
+    question = finding.answer.question
+    if question.min_reliability > 0 and finding.peak > question.threshold:
+        return read_as + (
+            f"{finding.text}: no Gaussian above the threshold of {question.threshold:.2f} has a reliability of at "
+            f"least {question.min_reliability:.2f}. Lower the minimum reliability."
+        )
     return read_as + (
-        f"{finding.text}: no Gaussian is above the threshold of {finding.answer.question.threshold:.2f}. "
+        f"{finding.text}: no Gaussian is above the threshold of {question.threshold:.2f}. "
         f"The largest relevancy is {finding.peak:.2f}{position}. Lower the threshold, or press Use suggested."
     )
 

@@ -45,7 +45,7 @@ def test_what_is_not_a_similarity_is_refused(tmp_path: Path) -> None:
         ("eye", "does not contain a transform"),
         ({"transform": [[1, 0, 0, 0]] * 3}, "`scale`"),
         ({"transform": [[1, 0, 0, 0]] * 3, "scale": 1}, "similarity"),
-        ({"transform": np.eye(4)[:3].tolist(), "scale": -1}, "rows: 3, scale: -1"),
+        ({"transform": np.eye(4)[:3].tolist(), "scale": -1}, "its scale is -1"),
         ({"transform": np.eye(4)[:3].tolist(), "scale": "big"}, "does not contain a transform"),
     ):
         path.write_text(json.dumps(content))

@@ -323,7 +323,7 @@ def test_existing_files_stay_unless_asked(tmp_path):
         write_langsplat(ours, PHOTO, "a.jpg", tmp_path, overwrite=False)
     other = RegionFeatures(Grid(9), ColorEncoder())
     write = partial(write_langsplat, other, PHOTO, "a.jpg", tmp_path)
-    refused(lambda: write(overwrite=False), "a_s.npy", "--overwrite True", error=FileExistsError)
+    refused(lambda: write(overwrite=False), "a_s.npy", "overwrite=True", error=FileExistsError)
     write(overwrite=True)
     assert len(np.load(tmp_path / "a_f.npy")) > 4
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a_f.npy", "a_s.npy"]

@@ -93,7 +93,7 @@ def test_overwrite_replaces_runs_and_nothing_else(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     run_dir.refuse_existing_run(run, overwrite=True)
     run_dir.refuse_existing_run(tmp_path / "new", overwrite=False)
-    with pytest.raises(FileExistsError, match="--timestamp"):
+    with pytest.raises(FileExistsError, match="another timestamp"):
         run_dir.refuse_existing_run(run, overwrite=False)
     (tmp_path / "photos").mkdir()
     with pytest.raises(FileExistsError, match=r"photos .*config\.yml"):

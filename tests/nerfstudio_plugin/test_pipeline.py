@@ -62,7 +62,7 @@ def test_the_run_is_lifted_in_place(train: Any, workspace: Path, registered: Non
     exif[0x0112] = 6
     Image.open(turned).save(turned, exif=exif)
     trained = train("whole", queries=("red", "sky blue"))
-    assert "Warning: Some images have an EXIF rotation, which training ignores (1 of 9," in capsys.readouterr().out
+    assert "Warning: Some image files have an EXIF rotation, which training ignores (1 of 9," in capsys.readouterr().out
     run_dir, expected_names = trained.config.parent, {"config.yml", "dataparser_transforms.json", "normlift"}
     assert {p.name for p in run_dir.glob("[!e]*")} == expected_names | {"nerfstudio_models"}  # and events
     assert [p.name for p in (run_dir / "nerfstudio_models").iterdir()] == ["step-000000001.ckpt"]

@@ -59,7 +59,7 @@ def test_an_existing_directory_is_replaced_only_if_told(copied: Path, field: Sem
     source = opened(copied)
     run_dir = write(source, field, timestamp="now")
     (run_dir / "note.txt").touch()
-    with pytest.raises(FileExistsError, match=rf"{run_dir} exists; .*--timestamp .*--output-dir.*--overwrite"):
+    with pytest.raises(FileExistsError, match=rf"{run_dir} exists; .*timestamp .*output_dir.*overwrite=True"):
         write(source, field, timestamp="now")
     assert (run_dir / "note.txt").exists()
     names = ("note.txt", "normlift/mine.json", "nerfstudio_models/a.ckpt", "exports/a")

@@ -46,6 +46,8 @@ def test_a_text_that_is_not_there_is_said_with_its_nearest_match():
     (verdict,) = diagnose_prompts(actions.set_threshold(state, 1.0))  # that nothing reaches
     assert verdict.warning.startswith("red: ") and verdict.warning.count("1.00") == 2
     assert "Use suggested" in verdict.warning and verdict.nearest_position is not None
+    (verdict,) = diagnose_prompts(actions.set_min_reliability(state, 1.0))  # leaves out all that match
+    assert "reliability of at least 1.00. Lower" in verdict.warning and "no Gaussian is above" not in verdict.warning
 
 
 def test_words_that_do_not_count_are_said() -> None:

@@ -309,7 +309,7 @@ def _listed_files(files: Sequence[Path], names: Any, split: str) -> Int[np.ndarr
     listed = set(names)
     unknown = sorted(map(str, listed - set(files)))
     if unknown:
-        raise InputError(f"the list of split {split} contains files that do not exist; the first is {unknown[0]}")
+        raise InputError(f"the list of split {split} contains files that belong to no frame; the first is {unknown[0]}")
     return np.array([i for i, file in enumerate(files) if file in listed], dtype=np.int32)
 
 

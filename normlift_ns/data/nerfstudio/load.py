@@ -321,8 +321,10 @@ def _training_poses(
             f"run{advice}."
         )
     if adjustment.shape[1:] != (6,) or not bool(adjustment.isfinite().all()):
+        is_shape_wrong = adjustment.shape[1:] != (6,)
+        problem = f"shape {tuple(adjustment.shape)}" if is_shape_wrong else "numbers that are NaN or infinite"
         raise InputError(
-            f"{checkpoint.path}: camera_optimizer.pose_adjustment has type {adjustment.dtype} and shape "
-            f"{tuple(adjustment.shape)}, expected finite numbers of shape ({len(split)}, 6). Copy the checkpoint again."
+            f"{checkpoint.path}: camera_optimizer.pose_adjustment has {problem}, expected finite numbers of shape "
+            f"({len(split)}, 6). Copy the checkpoint again."
         )
     return apply_pose_adjustments(split.poses, adjustment, model.camera_optimizer.mode)
