@@ -346,8 +346,8 @@ class RecordedVotes:
         store = self.field.store
         if isinstance(store, StoredEvidence) and store.evidence.num_views != len(names):
             raise InputError(
-                f"the run is damaged: number of lifted images {len(names)}, but number of images with evidence "
-                f"{store.evidence.num_views}; lift again with: ns-normlift"
+                f"the run lists {len(names)} images, but has evidence from {store.evidence.num_views} images; lift "
+                "again with: ns-normlift"
             )
         return tuple(names)
 

@@ -100,4 +100,4 @@ def test_command_writes_a_list_and_a_picture(inventory, lifted, tmp_path, monkey
     assert "exists" in said(capsys)
     words.write_text("fork\nred\nknife\n", encoding="utf8")
     assert run_entry(monkeypatch, query.entrypoint, *flags, "--overwrite", True) == 1
-    assert "2 of the 3 words" in (message := said(capsys)) and "fork, knife" in message
+    assert "(2 of 3); remove or replace: fork, knife" in said(capsys)
