@@ -135,7 +135,9 @@ def test_a_port_that_is_taken_is_told(monkeypatch, capsys):
             view.NormLiftView(Path("config.yml"), host=host, port=port, max_gaussians=7).main()
     lines = capsys.readouterr().out.splitlines()
     assert str(port) in lines[0] and len(lines) == 7
-    assert [call.args[0].runs._max_gaussians for call in opened.call_args_list] == [7, 7]
+    servers = [call.args[0] for call in opened.call_args_list]
+    assert [server.runs._max_gaussians for server in servers] == [7, 7]
+    assert all(server._server.should_exit for server in servers)
     for line in (lines[1], lines[4]):
         assert f"http://127.0.0.1:{port} " not in line and "http://127.0.0.1:" in line
     assert lines[2] == lines[6] == "Stopped." and "?access=" in lines[5]

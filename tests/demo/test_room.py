@@ -94,6 +94,8 @@ def test_held_out_views_see_all_classes_from_elsewhere(room: DemoRoom):
     assert set(range(1, 14)) <= set(seen.tolist())
     here, there = (torch.stack([c.world_to_camera.inverse()[:3, 3] for c in x]) for x in (held_out, demo_cameras()))
     assert torch.cdist(here, there).min() > 0.15
+    first = [1.25 * math.cos(math.radians(36)), 1.25 * math.sin(math.radians(36)), 1.5]
+    assert here[0].tolist() == pytest.approx(first, rel=1e-6)
     sizes = [(len(cameras), cameras[0].width, cameras[0].height) for cameras in (demo_cameras(), held_out_cameras())]
     assert sizes == [(24, 400, 300), (4, 400, 300)]
     empty = DemoRoom(room.scene, room.colors, torch.full_like(room.labels, -1), room.names)
