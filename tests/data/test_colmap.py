@@ -100,7 +100,7 @@ def test_two_formats_must_agree(tmp_path: Path) -> None:
     for name, old, new in (("cameras.txt", "500.5", "600.5"), ("images.txt", "photo 3", "photo 7")):
         whole = (folder / name).read_text()
         (folder / name).write_text(whole.replace(old, new))
-        with pytest.raises(InputError, match=r"two ways.* rm .*\*\.txt, or rm .*\*\.bin"):
+        with pytest.raises(InputError, match=r"contradictory.* rm .*\*\.txt, or rm .*\*\.bin"):
             read_colmap(tmp_path, None, None, advice="")
         (folder / name).write_text(whole)
 

@@ -41,7 +41,7 @@ def test_what_stands_in_the_file_and_in_a_frame_must_agree(tmp_path: Path) -> No
         ({"camera_model": "OPENCV"}, {"camera_model": "PINHOLE"}, (".camera_model", ".frames[].camera_model")),
     ):
         path = capture(tmp_path, {"fl_x": 50.0, **shared}, **frame)
-        with pytest.raises(InputError, match=r"two ways.*images/b\.png") as caught:
+        with pytest.raises(InputError, match=r"contradictory.*images/b\.png") as caught:
             read_transforms(path)
         for place in places:
             assert f"jq 'del({place})' transforms.json > new.json" in str(caught.value), place

@@ -145,6 +145,7 @@ def test_gains_are_those_of_a_loop(monkeypatch):
         expected = [looped(known, columns, v, []) for v in range(5)]
         assert coverage.gains(known, views, 5).tolist() == pytest.approx(expected, rel=1e-12)
         chosen = coverage.choose_views(known, views, 5, 3)
+        assert all(gain > 0 for _, gain in coverage.choose_views(known, views, 7, 7))  # the last two have no weight
         before: list[int] = []
         for view, found in chosen:
             rest = {v: looped(known, columns, v, before) for v in range(5) if v not in before}

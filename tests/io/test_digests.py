@@ -321,7 +321,7 @@ def test_evidence_of_counts_and_views_that_cannot_be(tmp_path: Path) -> None:
         ({"num_excluded": "16"}, {}, "num_excluded.*4, 1, 16"),
         ({"num_excluded": "-1"}, {}, "num_excluded.*4, 1, -1"),
         ({"format": "other"}, {}, "'other'"),
-        ({}, {"region_view": views.flip(0)}, "ascending"),
+        ({}, {"region_view": views.flip(0)}, "decrease"),
         ({}, {"region_view": views + 1}, r"1\.\.4.* 0\.\.3"),
         ({}, {"region_view": views.long()}, "region_view .*int64.*int32"),
         ({"num_views": "²"}, {}, "damaged .*²"),
