@@ -81,10 +81,10 @@ class Evidence(TensorRecord):
         _check_counts(self)
         offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight
         if offsets.numel() < 1 or int(offsets[-1]) != column.numel() or column.numel() != weight.numel():
-            last = int(offsets[-1]) if offsets.numel() > 0 else None
+            end = f"its offsets end at {int(offsets[-1])}" if offsets.numel() > 0 else "its offsets are empty"
             raise InputError(
-                f"Evidence.rows is inconsistent: its last offset is {last}, "
-                f"its number of columns is {column.numel()}, and its number of weights is {weight.numel()}"
+                f"Evidence.rows is inconsistent: {end}, but there are {column.numel()} columns and {weight.numel()} "
+                "weights"
             )
         if len(self.unlabeled) != self.num_gaussians:
             raise InputError(
