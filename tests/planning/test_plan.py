@@ -3,12 +3,22 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from normlift_ns.evidence_collection import ViewBatch
 from normlift_ns.io.run_dir import SCHEMA_VERSION, write_manifest
-from normlift_ns.planning import Measurements, Rate, _observe_loaded, _Observed, diagnose_recognition, make_plan
+from normlift_ns.planning import (
+    Measurements,
+    Rate,
+    _observe_loaded,
+    _Observed,
+    _per_view,
+    diagnose_recognition,
+    make_plan,
+)
 
 FACTS = Measurements(
     device="cpu, 2 threads", views=40, gaussians=1000, dimension=8, regions=10, entries=500, entry_bytes=8,
@@ -86,3 +96,11 @@ def test_recognition_of_a_lifted_run_is_shown(tmp_path: Path) -> None:
         write_manifest(folder, {**facts, "schema_version": SCHEMA_VERSION, "statistics": statistics}, {})
         (found,) = diagnose_recognition([tmp_path / "absent", tmp_path / name])
         assert found.state == "ok" and told in found.found
+
+
+def test_no_views_have_no_seconds() -> None:
+    block = SimpleNamespace(cameras=[])
+    observed: Any = SimpleNamespace(block=block, seconds=3.0)
+    assert _per_view(observed) is None
+    block.cameras = [1, 2]
+    assert _per_view(observed) == 1.5
