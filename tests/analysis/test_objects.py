@@ -89,7 +89,7 @@ def test_the_box_of_a_turned_cuboid_is_the_cuboid(seed, scale):
     box = objects.oriented_box(points)
     sizes = scale * 0.98 * np.array([4.0, 2, 1])  # 1 % is cut off at each end
     truth = objects.OrientedBox(*map(torch.from_numpy, (shift, sizes, rotation.T)))
-    assert box_iou(box, truth) > 0.9
+    assert box_iou(box, truth) > 0.88
     assert np.allclose(box.axes @ box.axes.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(box.axes) == pytest.approx(1)
     assert (np.diff(box.size) <= 0).all()
