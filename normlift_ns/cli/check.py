@@ -40,7 +40,7 @@ class NormLiftCheck(NormLift):
     output_json: Path | None = None
     """JSON file for the findings and the plan, in addition to the printed table."""
     overwrite: bool = False
-    """Replace an existing JSON file of --output-json, and accept that the run directory of --timestamp exists."""
+    """Replace an existing JSON file of --output-json, and allow an existing run directory of --timestamp."""
     dry_run: tyro.conf.Suppress[bool] = True
 
     def main(self) -> None:

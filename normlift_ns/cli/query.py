@@ -80,7 +80,7 @@ class NormLiftQuery(CheckedOptions):
     coordinates: Literal["scene", "capture"] = "scene"
     """Coordinate system of the positions in tables and --output-json. scene: that of the Gaussians and of viewers.
     capture: that of the original cameras, before the training rotated and scaled them. The JSON file of
-    --inventory has both. --meters-per-unit sets the table of objects to capture."""
+    --inventory has both. With --meters-per-unit, the table of objects always uses capture coordinates."""
     save_query: bool = False
     """Store the queries in the run in place of earlier ones. ns-render and ns-viewer then show their relevancy."""
     output_json: Path | None = None
@@ -95,7 +95,8 @@ class NormLiftQuery(CheckedOptions):
     three evenly spaced images."""
     explain: bool = False
     """For each prompt, list up to three images with the largest weight in the selection, and up to three others that
-    disagree. The columns are the weight, its share, the agreement, the disagreement and the number of regions."""
+    disagree. The columns are the weight, its share, the agreement, the disagreement and the number of regions.
+    Terminals with fewer than 120 columns show neither the weight nor the number of regions."""
     explain_dir: Path | None = None
     """Folder for the images of --explain, with outlines of the regions that contributed."""
     segment: Literal["sam3"] | None = None
@@ -112,8 +113,9 @@ class NormLiftQuery(CheckedOptions):
     box has the edge lengths of the oriented box, longest first, and extent has the size along x, y and z. Both span the
     1st to 99th percentile. R is the mean reliability. views counts the training images that show the object with at
     least a tenth of its largest visible area. best views has up to three of them. Images of the whole object come
-    first; within both groups, images in which the object appears larger come first. If there are more than 40 objects,
-    the table lists only the 10 largest, and a line below counts the objects of each prompt."""
+    before images of a part of it. Both groups are sorted by the size of the object in the image, largest first. If
+    there are more than 40 objects, the table lists only the 10 largest, and a line below counts the objects of each
+    prompt."""
     objects_dir: Path | None = None
     """Folder for the list of --objects or --inventory in capture and scene coordinates, with the axes of the boxes. The
     files are objects.json and objects.csv, and objects.ply and objects_scene.ply with the meshes of the boxes.

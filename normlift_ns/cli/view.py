@@ -29,7 +29,7 @@ class ServeOptions(CheckedOptions):
     other machines."""
     allowed_hosts: tuple[str, ...] = ()
     """Further host names under which browsers and programs may reach the server, such as that of a proxy. The server
-    answers requests under other names with status 403."""
+    rejects requests for other host names with status 403."""
     port: int = 7008
     """Port to listen on, in 1..65535. If it is in use, the server takes the first free one of the next 99 ports."""
     read_only: bool = False

@@ -29,7 +29,7 @@ class Weights:
     """Weights of an encoder or a mask source."""
 
     user: str
-    """Options for which these weights are the default, or that select them."""
+    """Options that use these weights by default or select them."""
     megabytes: float
     """Size of the download in millions of bytes. It is approximate for weights on the hub."""
     license: str

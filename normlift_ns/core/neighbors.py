@@ -23,10 +23,10 @@ _MAX_UNCERTAIN = 1000
 _BLOCK = 2**14
 """Number of positions per query of the k-d tree."""
 _MAX_RANKED = 2**22
-"""Number of candidates that are ranked at a time."""
+"""Largest number of candidates that are ranked at a time."""
 
 Progress = Callable[[int, int], None]
-"""Callback after every block of Gaussians, with the number of Gaussians that are done and their total."""
+"""Callback after every block of Gaussians, with the number of Gaussians that are done and the total number."""
 
 
 @check_arguments

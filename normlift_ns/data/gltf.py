@@ -246,7 +246,7 @@ def _glb_chunks(path: Path) -> tuple[bytes, bytes]:
 
 
 def _find_splat(gltf: _Gltf) -> tuple[int, _Primitive]:
-    """Return the only splat of a file and the index of its mesh."""
+    """Return the index of the mesh of the only splat in a file, and the splat."""
     primitives = [(index, item) for index, mesh in enumerate(gltf.document.meshes) for item in mesh.primitives]
     splats = [(index, primitive) for index, primitive in primitives if _EXTENSION in primitive.extensions]
     if len(splats) != 1:

@@ -165,9 +165,8 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
         raise InputError(f"{path} does not match the schema: {error}. Expected {_EXPECTED}.") from error
     checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_DIR, load_step))
     if data is not None and not data.is_dir():
-        raise FileNotFoundError(
-            f"The folder {data}, given with --data, does not exist. Give the new path of {saved.photographs}."
-        )
+        problem = "is not a folder" if data.exists() else "does not exist"
+        raise FileNotFoundError(f"{data}, given with --data, {problem}. Give the new path of {saved.photographs}.")
     cameras = read_transforms(
         run_dir / TRANSFORMS_FILE,
         None if data is None else data.absolute(),

@@ -177,8 +177,8 @@ class CachedTextMasks:
     """Folder, or name on the Hugging Face hub."""
     device: str
     folder: Path
-    """Folder with one safetensors file per image and prompt, created if it does not exist. If it is not writable,
-    nothing is cached."""
+    """Folder with one safetensors file for each pair of image and prompt, created if it does not exist. If it is not
+    writable, nothing is cached."""
 
     def find(self, image: UInt8[Tensor, "h w 3"], texts: Sequence[str]) -> Bool[Tensor, "q h w"]:
         """Return the union of the masks of each prompt. Raises the errors of `Sam3Network.load` and `segment`."""

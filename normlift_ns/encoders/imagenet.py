@@ -2,8 +2,8 @@
 
 `imagenet_words.json`, which research/imagenet_words.py writes, contains the names and hypernyms of all classes from
 WordNet 3.0. A name, such as "red fox", stands for all classes with that name. A hypernym, such as "dog" or "furniture",
-stands for all classes below it. The last word of a name, such as "panda", stands for all classes whose names end in
-this word. This does not apply to words that are themselves names or hypernyms: "dog" does not include hot dog.
+stands for all classes below it. The last word of a name, such as "trunks", stands for all classes whose names end
+in this word. This does not apply to words that are themselves names or hypernyms: "dog" does not include hot dog.
 """
 
 from __future__ import annotations

@@ -23,7 +23,8 @@ SPARE = 4
 """Number of candidates to keep in addition to the K nearest, because float32 rounding can change their order."""
 MAX_TREE_NEIGHBORS = SLOTS - SPARE
 _PAIRS = 2**24
-"""Number of distances that `brute_force_nearest` computes at a time. Each takes 8 bytes, and 24 for its components."""
+"""Number of distances that `brute_force_nearest` computes at a time. A distance takes 8 bytes, and the difference of
+the two points another 24."""
 _SORTED_IN_A_BLOCK = 4096
 """Largest number of points that torch sorts within one GPU block, without passes over memory."""
 _LEAVES = 2**14

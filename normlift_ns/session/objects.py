@@ -29,7 +29,8 @@ class ObjectRow:
     text: str
     """The prompt, or "selected by hand"."""
     number: int
-    """Number of the object, 1 for the largest object with the same text."""
+    """Number of the object among those with the same text, from 1: by descending size, or by the order of addition for
+    objects that were added by hand."""
     color: RGB
     """Color of the prompt or of selections by hand, RGB in 0..1."""
     mask: Bool[Tensor, " n"]
@@ -62,7 +63,7 @@ class ObjectList:
     """List of the objects of a selection."""
 
     objects: tuple[ObjectRow, ...]
-    """Listed objects, ordered by prompt and by descending size."""
+    """Listed objects, in the order of the prompts and then of their numbers."""
     left_out: int
     """Number of objects that are not listed because there are too many."""
     in_smaller_parts: int

@@ -290,7 +290,7 @@ class ConfigLoader(yaml.SafeLoader):
         """Name of the class, name and value of each unknown field."""
 
     def pass_over(self, cls: type, known: dict[str, Any], values: dict[str, Any]) -> None:
-        """Append the values of fields that a class does not have to `unknown`."""
+        """Add to `unknown` the fields that a class does not have, with their values."""
         self.unknown += [(cls.__name__, name, value) for name, value in values.items() if name not in known]
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:

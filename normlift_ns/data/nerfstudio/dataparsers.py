@@ -359,7 +359,7 @@ def parse_dataset(datamanager: config_classes.FullImageDatamanagerConfig, *, dat
             raise InputError(f"{str(error).removesuffix('.')}. {advice}") from error
         raise InputError(
             f"nerfstudio cannot read the dataset {parser.data} ({type(error).__name__}: {error}). Expected the dataset "
-            f"of the training. {advice}"
+            f"that the run was trained on. {advice}"
         ) from error
     scale = datamanager.camera_res_scale_factor
     return replace(dataset, train=dataset.train.resized(scale), held_out=dataset.held_out.resized(scale))
@@ -407,7 +407,7 @@ def _check_transforms(meta: TransformsEntries, path: Path, parser: config_classe
     if len(positions) == 1 and parser.auto_scale_poses and parser.center_method == "poses":
         raise InputError(
             f"{path}: all cameras have the same position (number of cameras: {len(meta.frames)}), so nerfstudio cannot "
-            "scale them. Expected the cameras of the training."
+            "scale them. Expected the cameras that the run was trained with."
         )
     _check_files([path.parent / frame.file_path for frame in meta.frames], path)
     count, masked = len(meta.frames), sum(frame.mask_path is not None for frame in meta.frames)
@@ -477,7 +477,7 @@ def _locate(file: Path, folder: Path) -> Path:
 def _camera_type(meta: TransformsEntries) -> str:
     model = "OPENCV" if meta.camera_model is None else meta.camera_model
     if model not in _CAMERA_TYPES:
-        raise InputError(f"the camera_model is {model!r}, expected a model of nerfstudio such as OPENCV")
+        raise InputError(f"the camera_model is {model!r}, expected a nerfstudio camera model such as OPENCV")
     return _CAMERA_TYPES[model]
 
 
