@@ -62,7 +62,7 @@ def test_the_last_step_is_taken_and_any_can_be_chosen(copied: Path) -> None:
     last, earlier = opened(copied), opened(copied, load_step=1)
     assert (last.checkpoint.step, earlier.checkpoint.step) == (2, 1)
     torch.testing.assert_close(earlier.gaussians.means, last.gaussians.means + 1)
-    with pytest.raises(FileNotFoundError, match=r"step 7, .* 1, 2\..*--load-step"):
+    with pytest.raises(FileNotFoundError, match=r"step 7\..* 1, 2\..*--load-step"):
         opened(copied, load_step=7)
 
 

@@ -130,7 +130,7 @@ def test_a_damaged_transform_of_the_training_switches_nothing_off(copied: Path) 
     path, unit = copied.parent / "dataparser_transforms.json", np.eye(4)[:3].tolist()
     cases: list[tuple[Any, str]] = [
         ({"transform": unit, "scale": float("nan")}, "NaN"),
-        ({"transform": unit, "scale": 0}, "rows: 3, scale: 0"),
+        ({"transform": unit, "scale": 0}, "its scale is 0"),
         ({"transform": [[1, 2], [3]], "scale": 1}, "transform"),
         ({"transform": unit, "scale": True}, "`float`, got `bool`"),
         ({"transform": [[1e200] * 4] * 3, "scale": 1}, "3 rows of 4 finite numbers"),

@@ -287,7 +287,7 @@ def test_counts_that_differ_say_why(panel: Any, pipeline: Any, monkeypatch: pyte
     assert "1 of the selected Gaussians cannot be drawn" in said(panel)
     assert f"{count} of the selected Gaussians match several prompts" in said(panel)
     panel.act(Action("Download selection"), client=(browser := Browser()))
-    assert f" {count - 1} Gaussians" in said(panel)
+    assert f"Gaussians: {count - 1}." in said(panel)
     rows[first] = False
     vertices = PlyData.read(io.BytesIO(browser.files["left__left_again.ply"]))["vertex"]
     means = np.stack([vertices[axis] for axis in "xyz"], axis=1)

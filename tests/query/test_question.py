@@ -94,7 +94,7 @@ def test_facts_have_their_types_and_ranges(tmp_path: Path) -> None:
         ({"texts": "a"}, "array.*str"),
         ({"texts": []}, "length >= 1"),
         ({"texts": [" "]}, "regex"),
-        ({"negatives": ["b"]}, "1 negatives"),
+        ({"negatives": ["b"]}, "negatives is 1"),
         ({"form": "lerf"}, "'lerf'.*negatives"),
         ({"form": "dot"}, "'dot'"),
         ({"more": 1}, "`more`"),
@@ -132,7 +132,7 @@ def test_vectors_fit_the_texts(tmp_path: Path) -> None:
         ({"vectors": torch.ones(1, 3, dtype=torch.float64)}, "float64"),
         ({"vectors": torch.zeros(1, 3)}, "'a' is zero"),
         ({"vectors": torch.tensor([[1.0, -torch.inf, 1.0]])}, "'a' is zero or not finite"),
-        ({"negative_vectors": torch.ones(1, 3)}, "0 negatives"),
+        ({"negative_vectors": torch.ones(1, 3)}, "negatives is 0"),
         ({"others": torch.ones(1, 3)}, "others"),
     ):
         store(tmp_path, FACTS, **tensors)
