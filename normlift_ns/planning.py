@@ -440,6 +440,13 @@ def _version(name: str) -> str | None:
         return None
 
 
+_LOCAL_WEIGHTS = (
+    "fetch default weights with ns-normlift-weights --get NAME, or give a local copy with --encoder-pretrained FILE "
+    "(open_clip), --encoder-model FOLDER (siglip, siglip2, metaclip2) or --sam-model PATH (SAM)"
+)
+"""Advice on weights that are not on this machine."""
+
+
 def missing_weights(options: SourceOptions, device: str) -> list[str]:
     """Return descriptions of the network weights that the options need and that are not on this machine."""
     if options.features != "none":
@@ -472,8 +479,7 @@ def diagnose_weights(missing: Sequence[str], options: SourceOptions, device: str
         "weights",
         "warning",
         message,
-        "fetch them now with ns-normlift-weights --get NAME, or give local files with --encoder-pretrained FILE or "
-        "--sam-model FILE",
+        _LOCAL_WEIGHTS,
     )
 
 
@@ -743,9 +749,7 @@ def dry_run(request: pipeline.LiftRequest, num_devices: int, start_time: float) 
     missing = missing_weights(options, device)
     if len(missing) > 0:
         raise FileNotFoundError(
-            f"A dry run encodes a few images, but this machine lacks {'; '.join(missing)}. "
-            "Fetch them with ns-normlift-weights --get NAME, or give local files with --encoder-pretrained and "
-            "--sam-model."
+            f"A dry run encodes a few images, but this machine lacks {'; '.join(missing)}; {_LOCAL_WEIGHTS}."
         )
     opened = open_capture(request, start_time)
     warning = compare_cameras(opened, lift, device) if request.check_alignment else None

@@ -127,7 +127,7 @@ def sample_near_surface(shape: Distance, low: Array, high: Array, density: float
 
 
 def project_to_surface(shape: Distance, points: Array, low: Array, high: Array) -> Array:
-    """Project points onto a nearby surface, and return those [n, 3] whose projections are in the box `low`..`high`."""
+    """Project the points near a surface onto it; return the projections [n, 3] that are in the box `low`..`high`."""
     points = points[np.abs(shape(points)) < _SHELL]
     for _ in range(2):
         points = points - shape(points)[:, None] * normals(shape, points)

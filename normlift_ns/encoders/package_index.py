@@ -176,7 +176,9 @@ def pip_settings() -> dict[str, str]:
         if chosen != os.devnull:  # os.devnull disables all configuration files
             parser.read([*(folder / name for folder in folders), *([chosen] if chosen else [])], "utf8")
     except (configparser.Error, UnicodeDecodeError) as error:
-        raise InputError(f"pip's configuration is invalid ({summarize_error(error)}); correct that file") from None
+        raise InputError(
+            f"a configuration file of pip is invalid ({summarize_error(error)}); find it with: pip config debug"
+        ) from None
     settings: dict[str, str] = {}
     for section in ("global", "download"):
         if parser.has_section(section):

@@ -199,7 +199,10 @@ def _of_signals(rows: Sequence[Mapping[str, Any]]) -> Numbers:
 
 
 def _of_timing(rows: Sequence[Mapping[str, Any]]) -> Numbers:
-    """Return two sums of seconds per scene: of evidence, consensus and lift, and of neighbors and vote."""
+    """Return the seconds of two groups of stages per scene.
+
+    `lift_s` is the sum for evidence, consensus and lift, and `post_lift_s` that for neighbors and vote.
+    """
     parts = {"lift_s": ("evidence_s", "consensus_s", "lift_s"), "post_lift_s": ("neighbors_s", "vote_s")}
     return {
         (row["scene"], metric): sum(row.get(name, 0.0) for name in names)

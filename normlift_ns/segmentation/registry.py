@@ -292,8 +292,11 @@ def check_mask_options(options: SourceOptions, name: str) -> MaskSource:
         if option not in source.options and value != getattr(default, option):
             shown = " ".join(value) if isinstance(value, tuple) else value
             regions = sorted(set(MASK_SOURCES.built_in).difference(get_args(FeatureKind)))
-            takers = " or ".join(x for x in regions if option in MASK_SOURCES.load(x).options)
+            takers = ", ".join(x for x in regions if option in MASK_SOURCES.load(x).options)
             flag = f"--{option.replace('_', '-')}"
-            raise InputError(f'{flag} {shown} applies to --regions {takers}, not to "{name}"; leave one of them out')
+            raise InputError(
+                f'{flag} {shown} works only with --regions {takers}, but the regions of this lift are "{name}"; omit '
+                f"{flag}, or choose other regions with --regions"
+            )
     source.check(options)
     return source
