@@ -47,6 +47,7 @@ def asks_for_node(backend: ModuleType) -> bool:
     return asked
 
 
+@pytest.mark.slow
 def test_node_is_asked_for_only_where_it_is_needed(backend: ModuleType, tmp_path: Path, monkeypatch) -> None:
     assert asks_for_node(backend)
     monkeypatch.setenv("NORMLIFT_NO_PAGE", "1")

@@ -93,6 +93,7 @@ def test_functions_have_old_keywords_and_every_option_of_version_0_2_is_tried():
                 function(*[None] * (function is run.catalogue), **{name: value})
 
 
+@pytest.mark.slow
 def test_ns_train_has_old_options_of_our_methods(capsys):
     from normlift_ns.method_configs import entry  # noqa: PLC0415
 

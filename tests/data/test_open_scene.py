@@ -298,6 +298,7 @@ def test_smaller_copies_of_the_images_and_shares_held_out(native, splat, frames,
         assert scene.train.names == [name for name in names if name not in expected]
 
 
+@pytest.mark.slow
 def test_coordinates_of_a_utm_zone_are_named_with_an_offset(splat, frames, given, tmp_path: Path) -> None:
     for shift, fails in ((np.array([500_000.0, 5_200_000, 300]), True), (np.array([40.0, -900, 3]), False)):
         far = [replace(frame, pose=np.column_stack([frame.pose[:, :3], frame.pose[:, 3] + shift])) for frame in frames]

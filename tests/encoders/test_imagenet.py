@@ -78,6 +78,7 @@ def encoder(state: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ima
     return ImageNetEncoder()
 
 
+@pytest.mark.slow
 def test_the_network_is_that_of_the_published_file(state: dict) -> None:
     assert len(state) == 386 and sum(value.numel() for value in state.values()) == 6_150_232
     names = list(state)

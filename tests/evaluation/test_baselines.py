@@ -94,6 +94,7 @@ def vala(seen: list[tuple[Camera, Tensor, Tensor]], means: Tensor) -> Tensor:
     return u
 
 
+@pytest.mark.slow
 def test_ideas_are_their_sums_over_pixels(lifted, monkeypatch):
     monkeypatch.setattr("normlift_ns.evaluation.baselines._BLOCK", 60)
     seen, methods = observations(lifted), (sfs, occam, vala, drsplat)
@@ -155,6 +156,7 @@ def test_runs_are_lifted_again_with_consensus_and_without(lifted, power):
     assert (agreed.field.scalars.norm - lifted.field.scalars.norm).mean() > 0.001
 
 
+@pytest.mark.slow
 def test_the_ablation_has_every_variant_whichever_way_a_run_was_lifted(lifted):
     """A run with consensus, and one without it, give the same rows; what cannot be made again is left out, and said."""
 

@@ -260,6 +260,7 @@ def test_runs_that_cannot_be_opened_are_not_listed(tmp_path, monkeypatch):
     assert warm == ["room-one"]  # fox-one does not fit into the memory
 
 
+@pytest.mark.slow
 def test_a_request_that_does_not_arrive_in_time_is_closed(tmp_path, monkeypatch):
     monkeypatch.setattr(app_module, "_HEADER_TIMEOUT", 0.3)
     monkeypatch.setattr(app_module, "_KEEP_ALIVE", 1)
