@@ -81,13 +81,7 @@ def caught(_: str) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_a_full_device_is_a_message(ended, monkeypatch):
-    for body, *flags in (
-        (info,),
-        (print,),
-        (lambda _: info("a" * 10**6),),
-        (caught,),
-        (info, "--help"),
-    ):
+    for body, *flags in ((info,), (print,), (lambda _: info("a" * 10**6),), (caught,), (info, "--help")):
         with open("/dev/full", "w") as full, monkeypatch.context() as patch:
             patch.setattr(sys, "stdout", full)
             code, _, err = ended(body, *flags)

@@ -99,8 +99,6 @@ def test_recognition_of_a_lifted_run_is_shown(tmp_path: Path) -> None:
 
 
 def test_no_views_have_no_seconds() -> None:
-    block = SimpleNamespace(cameras=[])
-    observed: Any = SimpleNamespace(block=block, seconds=3.0)
-    assert _per_view(observed) is None
-    block.cameras = [1, 2]
-    assert _per_view(observed) == 1.5
+    for cameras, seconds in (([], None), ([1, 2], 1.5)):
+        observed: Any = SimpleNamespace(block=SimpleNamespace(cameras=cameras), seconds=3.0)
+        assert _per_view(observed) == seconds

@@ -13,15 +13,8 @@ from PIL import Image
 from scipy import ndimage
 from skimage.color import rgb2lab
 
-from normlift_ns.segmentation.regions import (
-    COMPACTNESS,
-    Grid,
-    LabelFiles,
-    Superpixels,
-    _join_fragments,
-    read_image,
-    superpixels,
-)
+from normlift_ns.segmentation import regions
+from normlift_ns.segmentation.regions import COMPACTNESS, Grid, LabelFiles, Superpixels, read_image
 from tests.encoders.tiny import noise, refused
 
 
@@ -57,8 +50,8 @@ def test_superpixels_are_the_nearest_centers_of_a_loop_in_float64():
         cells = np.arange(rows * columns)
         far = np.maximum(abs(cells // columns - row[..., None]), abs(cells % columns - column[..., None])) > 1
         labels = np.where(far, np.inf, distance).argmin(axis=2)
-    expected = _join_fragments(labels.astype(np.int32), 0.25 * side**2)
-    assert (superpixels(torch.from_numpy(image), 24) == expected).mean() > 0.998  # ties are broken by rounding
+    expected = regions._join_fragments(labels.astype(np.int32), 0.25 * side**2)
+    assert (regions.superpixels(torch.from_numpy(image), 24) == expected).mean() > 0.998  # ties are broken by rounding
 
 
 def test_superpixels_keep_to_edges_also_of_tiny_images():

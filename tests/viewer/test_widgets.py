@@ -4,6 +4,9 @@ import base64
 import html
 import io
 import re
+import time
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -20,6 +23,7 @@ from normlift_ns.query.threshold import relevancy_histogram
 from normlift_ns.session import actions
 from normlift_ns.session.prompts import Prompt, build_query
 from normlift_ns.session.state import State
+from normlift_ns.viewer import adapter
 from normlift_ns.viewer.widgets import Explanation, diagnostics_mdx, explanation_mdx, histogram_svg, image_mdx
 from tests.session.worlds import BLOCK, read, rows, world
 
@@ -150,3 +154,17 @@ def test_names_of_prompts_stay_text():
     assert "2 more" in rest
     assert diagnostics_mdx(actions.show_prompt(state, 4)).count("<img") == 1
     assert diagnostics_mdx(State(space)) == ""
+
+
+def test_messages_are_handled_one_after_the_other(monkeypatch):
+    monkeypatch.setattr(adapter, "_MAX_HOLDUP", 60.0)
+    executor, handled = ThreadPoolExecutor(4), []
+    adapter.handle_in_order(SimpleNamespace(_websock_server=SimpleNamespace(_thread_executor=executor)))
+
+    def handle(number):
+        time.sleep(0.05 if number == 0 else 0)
+        handled.append(number)
+
+    for future in [executor.submit(handle, number) for number in range(4)]:
+        future.result(timeout=20)
+    assert handled == [0, 1, 2, 3]
