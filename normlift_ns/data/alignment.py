@@ -10,6 +10,7 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import NamedTuple
 
+import msgspec
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
@@ -101,9 +102,8 @@ def cached_alignment(
     """
     path = None if scene.renderer is not None else folder / f"{_alignment_key(scene, settings)}.safetensors"
     if path is not None and path.is_file():
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            psnr, worst, *rest = json.loads(load_arrays(path, key=path.stem).metadata["alignment"])
-            return Alignment(psnr, tuple(worst), *rest)
+        with suppress(OSError, ValueError, KeyError, TypeError, msgspec.ValidationError):
+            return msgspec.convert(json.loads(load_arrays(path, key=path.stem).metadata["alignment"]), Alignment)
     wait_for_kernels()
     match = measure_alignment(scene, settings, device=device)
     if path is not None:

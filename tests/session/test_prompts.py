@@ -88,12 +88,10 @@ def test_saving_keeps_what_is_saved():
     assert (both.texts, both.threshold) == (("red", "blue", "green"), 0.7)
     np.testing.assert_array_equal(both.embeddings, np.eye(3))
     assert merge_queries(None, two) is two and prompts_of_query(None) == ()
-    for how, different in (
-        ((["green"], True), r"rules cosine and lerf, negatives\)"),
-        (((), False), r"\(refined features\)"),
-    ):
+    other = (["green"], True, r"rules cosine and lerf, negatives\)")
+    for negatives, refined, different in (other, ((), False, r"\(refined features\)")):
         with pytest.raises(InputError, match=different):
-            merge_queries(one, posed("red", negatives=how[0], refined=how[1]))
+            merge_queries(one, posed("red", negatives=negatives, refined=refined))
     for folder, query, reason in ((None, one, "not stored"), (None, None, "no query")):
         with pytest.raises(InputError, match=reason):
             store_query(folder, query)
