@@ -6,6 +6,7 @@ import importlib.util
 from pathlib import Path
 from types import ModuleType
 
+import _distutils_hack
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -19,6 +20,8 @@ mkdir -p {page}/assets && echo page > {page}/index.html
 @pytest.fixture
 def backend(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
     """The backend, with a page folder of its own and no programs at all."""
+    # A library that has looked for pip, as huggingface_hub does, has turned setuptools' own distutils off
+    monkeypatch.delitem(vars(_distutils_hack.DISTUTILS_FINDER), "spec_for_distutils", raising=False)
     spec = importlib.util.spec_from_file_location("page_backend", ROOT / "web" / "backend.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
