@@ -7,7 +7,7 @@ WORKERS ?= 2
 export PYTHONDONTWRITEBYTECODE :=
 BESIDE := -n $(WORKERS) --dist worksteal
 
-.PHONY: check style changed-types quick-tests test test-slow test-all test-versions soak torture demo docs bench lint format clean
+.PHONY: check style quick-tests test test-slow test-all test-versions soak torture demo docs bench lint format clean
 
 # Compiles the kernels of the CPU rasterizer that no cache holds, which takes half a minute for each precision
 KERNELS = import torch; from normlift_ns.rasterization.numba import compile_kernels; compile_kernels(torch.float32, torch.float64).join()
@@ -26,23 +26,18 @@ style: .venv/installed
 	$(STYLE)
 
 lint: style
-	$(BIN)/basedpyright
+	$(BIN)/pyrefly check
 
-# The inner loop: style, types of the files that differ from main, and the fastest tests of the core
-check: style changed-types quick-tests
-
-changed-types: .venv/installed
-	@base=$$(git merge-base HEAD main 2>/dev/null || echo HEAD); \
-	{ git diff --name-only --diff-filter=d $$base; git ls-files --others --exclude-standard; } | sort -u | \
-	grep -E '^(normlift_ns|research)/.*\.py$$' | xargs -r $(BIN)/basedpyright
+# The inner loop: style, types, and the fastest tests of the core
+check: lint quick-tests
 
 QUICK := $(patsubst %,tests/core/test_%.py,lift relevancy neighbors gaussians metrics validation)
 quick-tests: .venv/installed
 	$(BIN)/pytest -q $(BESIDE) -m "not slow and not extra" $(QUICK) tests/test_imports.py
 
-# Style and types of the package are checked while its tests run; make lint checks the types of the benchmarks too
+# Style and types are checked while the tests run
 test: .venv/installed
-	@{ $(STYLE) && $(BIN)/basedpyright normlift_ns; } > .venv/checks.log 2>&1 & checks=$$!; \
+	@{ $(STYLE) && $(BIN)/pyrefly check; } > .venv/checks.log 2>&1 & checks=$$!; \
 	$(BIN)/pytest $(BESIDE) $(JUNIT) -m "not slow and not extra" --ignore=tests/browser --ignore=tests/torture; tests=$$?; \
 	wait $$checks; checks=$$?; cat .venv/checks.log; exit $$((tests + checks))
 

@@ -83,7 +83,7 @@ _HOMES = {
 """Public names by the module that defines them."""
 _HOME = {name: f"normlift_ns.{module}" for module, names in _HOMES.items() for name in names.split()}
 
-__all__ = list(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = list(_HOME)  # pyrefly: ignore[unresolvable-dunder-all]
 
 
 def __getattr__(name: str) -> Any:

@@ -716,9 +716,8 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> config_classes.Tra
     config.timestamp = run_dir.name
     config.relative_model_dir = Path(CHECKPOINT_DIR)
     config.load_dir = config.load_step = config.load_config = config.load_checkpoint = None
-    config.pipeline.model = config_classes.NormLiftModelConfig(
-        **{**vars(source.model_config), "semantics": Path(FIELD_FOLDER)}
-    )
+    options: dict[str, Any] = {**vars(source.model_config), "semantics": Path(FIELD_FOLDER)}
+    config.pipeline.model = config_classes.NormLiftModelConfig(**options)
     if location.data_moved or config.output_dir.is_absolute():
         set_dataset(config, location.data)  # relative paths would not resolve to the dataset
     skip_seed_points(config)

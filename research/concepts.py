@@ -65,7 +65,7 @@ def evidence_panels(world: World, observed: Observed, classes: Tensor, names: Se
     mine = slice(int(rows.offsets[gaussian]), int(rows.offsets[gaussian + 1]))
     column, weight = rows.column[mine].long(), rows.weight[mine]
     region = observed.columns[0][world.cells.of_pixel.long()]
-    found = []
+    found: list[tuple[str, Tensor | np.ndarray, bool]] = []
     for i in weight.argsort(descending=True)[:3].tolist():
         view = int(observed.evidence.region_view[column[i]])
         colours, _ = render(world.scene, world.cameras[view], torch.as_tensor(world.colors))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import nan
 from pathlib import Path
+from typing import Any
 
 from research.report import RESULTS, Metric
 
@@ -61,7 +62,9 @@ def read(path: Path) -> Document:
     if not path.exists():
         return Document(f"python -m research.{path.stem.removesuffix('_gpu')}", "no machine so far", ())
     content = json.loads(path.read_text())
-    rows = ({**row, "value": nan if row["value"] is None else row["value"]} for row in content["metrics"])
+    rows: Iterator[dict[str, Any]] = (
+        {**row, "value": nan if row["value"] is None else row["value"]} for row in content["metrics"]
+    )
     return Document(content["command"], content["hardware"], tuple(Metric(**row) for row in rows))
 
 

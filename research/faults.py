@@ -75,7 +75,7 @@ CALLS = {
     ),
 }
 CHECKS = re.compile(r"^_?(check|refuse|ensure|require|validate|writable)_?")
-SWAPPED = {
+SWAPPED: dict[type[ast.cmpop], str] = {
     ast.Lt: ">=",
     ast.GtE: "<",
     ast.Gt: "<=",
@@ -87,7 +87,7 @@ SWAPPED = {
     ast.In: "not in",
     ast.NotIn: "in",
 }
-BOUNDS = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
+BOUNDS: dict[type[ast.cmpop], str] = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
 
 
 @dataclass(frozen=True)
@@ -287,7 +287,7 @@ def passed(root: Path, fault: Fault) -> str:
     checks = (
         (binaries / "ruff", "check", "-q", fault.file),
         (binaries / "python", "-W", "ignore", "-c", f"import {module}"),
-        (binaries / "basedpyright", fault.file),
+        (binaries / "pyrefly", "check", fault.file),
     )
     with planted(root, [fault]):
         subprocess.run([binaries / "ruff", "format", "-q", fault.file], cwd=root, check=True)

@@ -173,7 +173,7 @@ def plain(one: Observation) -> Tensor:
 
 def fit(found: Sequence[Observation], search: Mapping[str, Sequence[float]] = SEARCH) -> tuple[RefineConfig, ...]:
     """Return the best combination for the full method, and that for plain voting."""
-    combinations = [dict(zip(search, values)) for values in product(*search.values())]
+    combinations: list[dict[str, Any]] = [dict(zip(search, values)) for values in product(*search.values())]
     configs = [replace(START, **values) for values in combinations]
     full = [mean_miou(found, config) for config in configs]
     knn = [float(np.mean([one.miou(config, plain(one)) for one in found])) for config in configs]

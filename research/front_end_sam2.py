@@ -17,7 +17,7 @@ from research.front_end_inputs import SMALL, Injected, Size
 from research.front_end_networks import seconds
 from research.report import Report
 
-LARGE = {
+LARGE: dict[str, Any] = {
     "hidden_size": 144,
     "num_attention_heads": 2,
     "blocks_per_stage": [2, 6, 36, 4],
@@ -28,7 +28,7 @@ LARGE = {
     "window_positional_embedding_background_size": [7, 7],
 }
 """Configuration of the image encoder of facebook/sam2.1-hiera-large."""
-LITTLE = {
+LITTLE: dict[str, Any] = {
     "hidden_size": 8,
     "blocks_per_stage": [1, 1, 2, 1],
     "embed_dim_per_stage": [8, 16, 32, 64],

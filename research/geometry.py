@@ -117,7 +117,9 @@ def geometry(seen: Seen, things: Mapping[str, Tensor], g: torch.Generator) -> di
     found = {f"drift.{key}": cosine for key, (cosine, _) in curve.items()}
     cosines, angles = np.array(list(curve.values())).T
     start = (cosines[-1], cosines[0], 20.0)
-    fitted, _ = curve_fit(lambda x, far, near, scale: far + (near - far) * np.exp(-x / scale), angles, cosines, start)
+    fitted: np.ndarray = curve_fit(
+        lambda x, far, near, scale: far + (near - far) * np.exp(-x / scale), angles, cosines, start
+    )[0]
     found |= dict(zip(("far", "near", "scale"), map(float, fitted)))
     for name, some in things.items():
         found |= {f"{name}.drift.{key}": cosine for key, (cosine, _) in seen.drift(_sample(some, g)).items()}

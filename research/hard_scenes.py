@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -154,7 +155,8 @@ def out_of_range(setting: Setting) -> dict[str, float]:
     arrays = {name: getattr(others, name)[:1].repeat_interleave(len(bad), 0) for name in _PARAMETERS}
     for row, (name, column, value) in enumerate(bad):
         arrays[name][row, column] = value
-    mixed = replace(others, **{name: torch.cat([arrays[name], getattr(others, name)]) for name in _PARAMETERS})
+    changed: dict[str, Any] = {name: torch.cat([arrays[name], getattr(others, name)]) for name in _PARAMETERS}
+    mixed = replace(others, **changed)
     views, wrong = _views(2), 0
     for mode in ("classic", "antialiased"):
         for backend in setting.backends:

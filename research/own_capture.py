@@ -226,7 +226,7 @@ def write_points(path: Path, things: Mapping[str, tuple[Mesh, np.ndarray]]) -> N
 
 def render(things: Mapping[str, tuple[Mesh, np.ndarray]], poses: list[np.ndarray], output: Path) -> None:
     """Write images and masks."""
-    import mujoco  # noqa: PLC0415 # pyright: ignore[reportMissingImports]
+    import mujoco  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory() as folder:
         for i, (mesh, texture) in enumerate(things.values()):

@@ -10,6 +10,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -241,7 +242,8 @@ def with_floaters(world: World, share: float = 0.05, seed: int = 0) -> World:
     scales = (SHADE / depth).sqrt() * (0.5 + torch.rand(count, 3, generator=g))
     floaters = GaussianScene(means, torch.randn(count, 4, generator=g), scales, opacities)
     names = ("means", "quats", "scales", "opacities")
-    joined = replace(scene, **{name: torch.cat([getattr(x, name) for x in (scene, floaters)]) for name in names})
+    both: dict[str, Any] = {name: torch.cat([getattr(x, name) for x in (scene, floaters)]) for name in names}
+    joined = replace(scene, **both)
     evidence, cells = cell_evidence(joined, world.cameras, world.cells.maps)
     truth = torch.cat([world.truth, torch.full((count,), NO_CLASS)])
     colors = None if world.colors is None else torch.cat([world.colors, torch.full((count, 3), 0.6)])

@@ -172,7 +172,8 @@ def _make_capture(line: str, options: Sequence[str], common: NormLift, location:
         if source is None or len(rest) > 0:
             command = _parse([*options, *own])
         else:  # lines without options avoid tyro, which is slow
-            command = replace(common, **{source: Path(first)})
+            changed: dict[str, Any] = {source: Path(first)}
+            command = replace(common, **changed)
     except InputError as error:
         raise InputError(f"{location}: {error}") from None
     key = _capture_key(command)

@@ -364,7 +364,7 @@ def parse_flags(command: type[_Command], arguments: Sequence[str], name: str | N
     program = Path(sys.argv[0])
     if name is None and program.parent == Path(__file__).parent:  # started as a module
         name = f"python -m {__package__}.{program.stem}"
-    flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[add_help_texts(command)]]
+    flags: Any = tyro.conf.OmitArgPrefixes[tyro.conf.FlagConversionOff[add_help_texts(command)]]  # pyrefly: ignore[invalid-annotation]
     arguments = fill_boolean_values(rename_flags(arguments, renamed_flags(command)), boolean_flags(command))
     prints_help = {"-h", "--help"} & set(arguments)
     with _legible_help() if prints_help else one_line_errors(name or sys.argv[0]):

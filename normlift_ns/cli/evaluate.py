@@ -97,7 +97,7 @@ class NormLiftEval(CheckedOptions):
             "ablation": lambda: studies.study_ablation(loaded, evaluate, device, info),
             "sweeps": lambda: studies.study_votes(loaded, evaluate, studies.sweeps, device),
         }
-        found = {name: measure[name]() for name in self.study}
+        found: dict[str, list[Row]] = {name: measure[name]() for name in self.study}
         compared = compare_with_paper(evaluation, found) if self.compare == "paper" else {}
         write_evaluation(
             self.output_path, evaluation, names, studies=found, comparison=compared, overwrite=self.overwrite

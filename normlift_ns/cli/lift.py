@@ -260,7 +260,7 @@ class NormLift(CheckedOptions):
         if self.add_images is None:
             return scene
         count = len(scene.train)
-        scene = add_extra_images(scene, self.add_images)
+        scene = add_extra_images(scene, self.add_images)  # pyrefly: ignore[bad-specialization]
         common.info_progress(f"New images from {self.add_images}, added to the lift: {len(scene.train) - count}.")
         return scene
 

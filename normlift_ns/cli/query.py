@@ -372,7 +372,7 @@ class NormLiftQuery(CheckedOptions):
             check_new_files(path, overwrite=self.overwrite, flags=flag)
         check_writable_folder(self.render_dir, "--render-dir")
         check_writable_folder(self.explain_dir, "--explain-dir")
-        tables = [] if self.objects_dir is None else [self.objects_dir / name for name in CATALOG_FILES]
+        tables: list[Path] = [] if self.objects_dir is None else [self.objects_dir / name for name in CATALOG_FILES]
         check_new_files(*tables, overwrite=self.overwrite, flags="--objects-dir")
         written = {Path(os.path.realpath(path)) for _, path in files if path is not None}
         written.update(Path(os.path.realpath(path)) for path in tables)

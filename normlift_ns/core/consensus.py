@@ -395,7 +395,7 @@ def _inner_products(
     else:
         by_region, shares, visible = (x.to("cpu") for x in (by_region, shares, visible))
         for block in _sparse_blocks(by_region, shares, visible, view.cpu(), views):
-            yield tuple(x.to(view.device) for x in block)  # pyright: ignore[reportReturnType]
+            yield tuple(x.to(view.device) for x in block)  # pyrefly: ignore[invalid-yield]
 
 
 def _sparse_blocks(

@@ -22,7 +22,7 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import check_device, option_setting
 
 MIN_TRITON_VERSION = 3
-Items = TypeVar("Items", Sequence, Tensor)  # pyright: ignore[reportMissingTypeArgument]
+Items = TypeVar("Items", Sequence, Tensor)
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Record = TypeVar("Record")

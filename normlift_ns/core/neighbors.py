@@ -42,7 +42,7 @@ class Neighbors(NamedTuple):
     ([0.0, 2.0, inf], [2.0, 2.0, 2.0])
     """
 
-    index: Int32[Tensor, "m k"]  # pyright: ignore[reportIncompatibleMethodOverride]
+    index: Int32[Tensor, "m k"]
     """Indices of the neighbors, padded with -1 if fewer than K other Gaussians have finite means."""
     distance: Float[Tensor, "m k"]
     """Euclidean distances in the units of the means, padded with inf. Float64, or float32 from the search on a GPU."""

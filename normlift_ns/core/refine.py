@@ -209,7 +209,7 @@ def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
     ...     clamp_k(RefineConfig(k=100), 5).k, str(caught[0].message)
     (4, 'k is 100, but only 4 other Gaussians can vote; the vote uses 4 neighbors')
     """
-    gate = {"tau": config.tau, "gamma": config.gamma}  # the pipeline may measure those that are None
+    gate: dict[str, Any] = {"tau": config.tau, "gamma": config.gamma}  # the pipeline may measure those that are None
     config = replace(config, **(config.numbers._asdict() | gate))
     k = min(config.k, max(1, n - 1), MAX_VOTERS)
     if k == config.k:

@@ -45,7 +45,7 @@ def allow_numpy_scalars() -> Iterator[None]:
         torch.serialization.add_safe_globals(numpy_scalar_globals())  # torch 2.4 cannot remove them again
         yield
         return
-    allowed: dict[str, Any] = torch._weights_only_unpickler._get_allowed_globals()  # pyright: ignore
+    allowed: dict[str, Any] = torch._weights_only_unpickler._get_allowed_globals()  # pyrefly: ignore[implicit-import]
     before = dict(allowed)
     allowed |= {"numpy.dtype": _unread_dtype, "_codecs.encode": _latin1}
     allowed |= {f"{module}.scalar": _unread for module in _MODULES}

@@ -210,7 +210,7 @@ def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
             f"{', '.join(_MODELS)}. Undistort the images, keep the splat, and give the new folder with "
             f"--colmap: colmap image_undistorter --image_path IMAGES --input_path {model} --output_path new"
         )
-    lens = Intrinsics(width=camera.width, height=camera.height, **parameters)
+    lens = Intrinsics(**parameters, width=camera.width, height=camera.height)  # pyrefly: ignore[bad-argument-type]
     return lens.as_fisheye() if "FISHEYE" in camera.model else lens
 
 

@@ -509,6 +509,6 @@ def _ring(count: int, radius: float, height: float) -> Array:
 
 def _bananas(x: float, y: float, z: float) -> list[Part]:
     """Return a bunch of bananas with stems at (x, y, z) that arches over the table."""
-    tints = banded(shapes.banana_end, _STEM)
-    banana = Part("banana yellow", 26, shapes.banana(0.044), lambda p: _RIPE * tints(p), 0.15)
+    tints, ripe = banded(shapes.banana_end, _STEM), np.array(_RIPE)
+    banana = Part("banana yellow", 26, shapes.banana(0.044), lambda p: ripe * tints(p), 0.15)
     return [_at(banana, x, y, z + 0.012 * i, -75 + 17 * i, -62 + 16 * i) for i in range(4)]

@@ -226,7 +226,7 @@ def _is_network_error(error: Exception) -> bool:
 def _connect(rank: int, size: int, backend: str, log: Callable[[str], None]) -> tuple[Any, Heartbeat]:
     """Connect to the other processes; return the store of counters, and the running heartbeat of this process."""
     import torch.distributed as dist  # noqa: PLC0415 (as above)
-    from torch.distributed import PrefixStore, TCPStore  # noqa: PLC0415 # pyright: ignore[reportPrivateImportUsage]
+    from torch.distributed import PrefixStore, TCPStore  # noqa: PLC0415
 
     host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
     is_host = rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"

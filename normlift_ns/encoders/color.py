@@ -143,7 +143,7 @@ def embed_colors(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 343"
 
     anchors, cholesky = _anchors()
     kernel = _kernel(anchors, shading_coordinates(lab))
-    return _normalized(solve_triangular(cholesky, kernel, lower=True).T)
+    return _normalized(np.asarray(solve_triangular(cholesky, kernel, lower=True)).T)
 
 
 def shading_coordinates(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:

@@ -213,7 +213,7 @@ def _sizes(values: object, where: str) -> dict[str, Any]:
         return {}
     if not isinstance(values, Mapping):
         raise InputError(f"{where} of {CONFIG_FILE} is {type(values).__name__}, expected an object")
-    sizes = {}
+    sizes: dict[str, Any] = {}
     for key, maximum in _MAX_SIZES.items():
         value = values.get(key)
         if value is None:

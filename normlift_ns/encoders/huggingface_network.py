@@ -248,9 +248,9 @@ class HuggingFaceEncoder(NetworkEncoder):
     family: huggingface.ModelFamily
     model: str
     """Folder, or name on the Hugging Face hub."""
-    fill: CropFill = "black"
-    device: str = "cpu"
-    template: str = "{}"
+    fill: CropFill = "black"  # pyrefly: ignore[bad-override]
+    device: str = "cpu"  # pyrefly: ignore[bad-override]
+    template: str = "{}"  # pyrefly: ignore[bad-override]
 
     def _check_names(self) -> None:
         huggingface.check_model_name(self.model, self.family)

@@ -169,9 +169,9 @@ class OpenClipEncoder(NetworkEncoder):
     """Name of the architecture, one of open_clip.list_models()."""
     pretrained: str = DEFAULT_PRETRAINED
     """Tag of the weights to download, or a local weight file. Pickle files are read with weights_only=True."""
-    fill: CropFill = "black"
-    device: str = "cpu"
-    template: str = "{}"
+    fill: CropFill = "black"  # pyrefly: ignore[bad-override]
+    device: str = "cpu"  # pyrefly: ignore[bad-override]
+    template: str = "{}"  # pyrefly: ignore[bad-override]
 
     def _check_names(self) -> None:
         check_open_clip_names(self.model, self.pretrained)

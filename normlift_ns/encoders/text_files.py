@@ -187,7 +187,7 @@ class TextEmbeddingFile(LazyTextEncoder):
             if comment.startswith(_COMMENT_PREFIX) and comment != expected:
                 raise InputError(f"its digest is {expected.decode()!r}, expected {comment.decode('latin1')!r}")
         except (  # exceptions of zipfile and zlib
-            OSError, ValueError, LookupError, EOFError, RuntimeError, NotImplementedError, OverflowError,
+            OSError, ValueError, LookupError, EOFError, RuntimeError, OverflowError,
             zipfile.BadZipFile, zlib.error, struct.error,
         ) as error:  # fmt: skip
             raise InputError(

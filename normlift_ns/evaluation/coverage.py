@@ -675,7 +675,7 @@ def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
     right.imshow(picture.image.float().mean(dim=2).numpy(), cmap="gray", vmin=0, vmax=255)
     heat = right.imshow(picture.reliability.numpy(), cmap="inferno", vmin=0, vmax=1, alpha=0.75)
     scale = figure.colorbar(heat, ax=right, fraction=0.05)
-    scale.solids.set_alpha(1.0)  # pyright: ignore[reportOptionalMemberAccess]
+    scale.solids.set_alpha(1.0)  # pyrefly: ignore[missing-attribute]
     scale.set_label("R")
     right.set_title("reliability")
     for axes in (left, right):

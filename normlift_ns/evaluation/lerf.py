@@ -111,7 +111,7 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
         mask = masks.setdefault(category, np.zeros((height, width), np.uint8))
         scaled = points * scale
         drawn = np.zeros_like(mask)
-        cv2.fillPoly(drawn, [np.int32(scaled)], 1)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        cv2.fillPoly(drawn, [np.int32(scaled)], 1)  # pyrefly: ignore[no-matching-overload]
         if not drawn.any():
             raise InputError(
                 f"{file} has a segmentation of {category!r} outside its image of {size[0]} x {size[1]} pixels; correct "
@@ -290,7 +290,7 @@ def summarize_lerf(rows: Sequence[dict[str, Any]], average: AveragingOrder, sett
             frames of a category, then over categories.
     """
     by_scene = _grouped(rows, lambda row: row["scene"])
-    scenes = [
+    scenes: list[dict[str, Any]] = [
         {"scene": scene, "frames": len({row["frame"] for row in group}), **_averages(group, average)}
         for scene, group in by_scene.items()
     ]

@@ -89,7 +89,7 @@ def clean_mask(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
     image, square = mask.cpu().numpy().astype(np.uint8), np.ones((3, 3), np.uint8)
     for step in (cv2.erode, cv2.dilate, cv2.dilate, cv2.erode):
         image = step(image, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    labels, count = ndimage.label(image, structure=square)  # pyright: ignore[reportGeneralTypeIssues]
+    labels, count = ndimage.label(image, structure=square)
     if count == 0:
         return torch.zeros_like(mask, device="cpu")
     sizes = np.bincount(labels.ravel())

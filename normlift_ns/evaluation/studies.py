@@ -180,7 +180,7 @@ class Vote:
 def recorded_vote(manifest: Mapping[str, Any]) -> Vote:
     """Return the vote of the lift from its manifest, with defaults for missing values."""
     options = manifest.get("options", {})
-    kind = {"vote": "paper"} if "vote" in options else {}  # the only kind in version 0.1
+    kind: dict[str, Any] = {"vote": "paper"} if "vote" in options else {}  # the only kind in version 0.1
     config = RefineConfig(**{**kind, **options.get("vote", {})})
     return Vote(config.vote, config, options.get("reliability_beta", BETA), {})
 
@@ -465,7 +465,7 @@ def study_votes(
     """Evaluate the protocol with the votes that `votes` yields for the runs. Equal votes are evaluated once."""
     voters = [make_voter(lifted.field, lifted.scene.gaussians.means, device) for lifted in runs]
     results: dict[Any, Mapping[str, float]] = {}
-    rows = []
+    rows: list[Row] = []
     for run_votes in votes([recorded_vote(lifted.field.manifest) for lifted in runs]):
         key = tuple((vote.variant, vote.config, vote.beta) for vote in run_votes)
         if key not in results:

@@ -53,7 +53,7 @@ class NormLiftPipelineConfig(VanillaPipelineConfig):
 class NormLiftPipeline(VanillaPipeline):
     """splatfacto's pipeline with a lift of the last checkpoint in the same run."""
 
-    config: NormLiftPipelineConfig
+    config: NormLiftPipelineConfig  # pyrefly: ignore[bad-override-mutable-attribute]
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

@@ -383,9 +383,9 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
         values = gaussian_relevancy(block, negative, valid, question.rule)
         verdicts += _judge_all(field, question.rule, block, values, valid)
         block[:] = values
-    means = means if isinstance(means, np.ndarray) else means.detach()
+    points: Any = means if isinstance(means, np.ndarray) else means.detach()
     selected = relevancy[:0] > 0
-    unselected = Answer(question, cast("SemanticField", field), means, relevancy, valid, selected, tuple(verdicts))
+    unselected = Answer(question, cast("SemanticField", field), points, relevancy, valid, selected, tuple(verdicts))
     return apply_threshold(unselected, question)
 
 

@@ -244,7 +244,7 @@ def _gradients(
 
 def compiled_rasterizer() -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Return gsplat's compiled forward and backward functions for pixels. Their names depend on the gsplat version."""
-    from gsplat.cuda._backend import _C  # noqa: PLC0415 # pyright: ignore[reportAttributeAccessIssue]
+    from gsplat.cuda._backend import _C  # noqa: PLC0415
 
     name = "rasterize_to_pixels_3dgs" if hasattr(_C, "rasterize_to_pixels_3dgs_fwd") else "rasterize_to_pixels"
     return getattr(_C, f"{name}_fwd"), getattr(_C, f"{name}_bwd")

@@ -122,7 +122,7 @@ def _row_products(part: Bool[Tensor, "m p"]) -> Tensor:
     if part.is_cuda and hasattr(torch, "_int_mm"):
         count, pixels = part.shape
         padded = pad(part.view(torch.int8), (0, -pixels % 16, 0, max(32 - count, -count % 16)))  # tensor core sizes
-        return torch._int_mm(padded, padded.T)[:count, :count]  # pyright: ignore[reportPrivateImportUsage]
+        return torch._int_mm(padded, padded.T)[:count, :count]
     exact = part.float()
     return exact @ exact.T
 

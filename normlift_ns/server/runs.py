@@ -333,8 +333,8 @@ class ServedRun:
             found = self._memories.get(token)
             if found is not None and found.page is not None:
                 token = secrets.token_urlsafe(16)
-                copy = {name: value for name, value in vars(found).items() if name != "page"}
-                found = PageMemory(**{**copy, "clicks": dict(found.clicks)})
+                copy: dict[str, Any] = {name: value for name, value in vars(found).items() if name != "page"}
+                found = PageMemory(**(copy | {"clicks": dict(found.clicks)}))
             if found is None:
                 found = PageMemory(History.of(State(self.space), lean=State.without_caches))
             found.page = page

@@ -209,7 +209,11 @@ def encode_question(served: ServedRun, question: Question) -> tuple[tuple[Any, .
     Raises:
         ValueError: The encoder cannot encode a prompt.
     """
-    settings = {"negatives": question.negatives, "relevancy": question.relevancy, "threshold": question.threshold}
+    settings: dict[str, Any] = {
+        "negatives": question.negatives,
+        "relevancy": question.relevancy,
+        "threshold": question.threshold,
+    }
     settings |= {"min_reliability": question.min_reliability, "refined": question.refined}
     prompts = encode_prompts(join_prompts(question.texts), served.read, served.stored())
     unknown = next((prompt.error for prompt in prompts if prompt.error), None)

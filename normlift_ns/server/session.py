@@ -282,7 +282,7 @@ class PageSession:
 
     def _pick(self, state: State, value: protocol.Pick) -> State:
         weights = self._run.weights(value.origin, value.direction)
-        return self._visible(actions.click(state, weights, value.mode))  # pyright: ignore[reportArgumentType]
+        return self._visible(actions.click(state, weights, value.mode))  # pyrefly: ignore[bad-argument-type]
 
     def _select_object(self, state: State, value: protocol.ObjectAction) -> State:
         row = self._object(value.id)
@@ -331,7 +331,7 @@ class PageSession:
     async def _ask_line(self, seq: int, **settings: Any) -> None:
         memory, line = self._memory, self._memory.line
         negatives = memory.negatives
-        options = {
+        options: dict[str, Any] = {
             "relevancy": memory.rule,
             "negatives": negatives,
             "min_reliability": memory.min_reliability,

@@ -41,7 +41,7 @@ def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class
         CONFIG_CLASS_NAMES[cls] = f"{module}.{cls.__name__}"
         if target is not None:
             CLASS_TARGETS[cls] = target if "." in target else f"{module}.{target}"
-        return dataclass(cls)
+        return dataclass(cls)  # pyrefly: ignore[bad-return]
 
     return register
 

@@ -354,7 +354,8 @@ def parse_dataset(datamanager: config_classes.FullImageDatamanagerConfig, *, dat
             raise InputError("the dataset has no training images")
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{error} {advice}") from error
-    except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:  # raised by torch and NumPy for invalid numbers
+    # Raised for invalid numbers; LinAlgError is a ValueError only in newer versions of NumPy
+    except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:  # pyrefly: ignore[unreachable-except-clause]
         if isinstance(error, InputError) and str(parser.data) in str(error):
             raise InputError(f"{str(error).removesuffix('.')}. {advice}") from error
         raise InputError(
