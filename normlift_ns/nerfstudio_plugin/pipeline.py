@@ -131,8 +131,8 @@ def feature_source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSour
         if options.features != "langsplat":
             raise
         raise FileNotFoundError(
-            f"{error}. Write the features there with LangSplat's preprocessing, give their folder with "
-            "--pipeline.source.features-dir, or compute features from the images with --pipeline.source.features none"
+            f"{error}. In ns-train, put pipeline.source before the option, as in --pipeline.source.features-dir. "
+            "To encode the images instead, use --pipeline.source.features none"
         ) from error
 
 

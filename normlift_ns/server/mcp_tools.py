@@ -95,8 +95,8 @@ class Tools:
         isolate: Annotated[bool, Field(description="Draw only the matches")] = False,
         mode: ColorMode = "overlay",
     ) -> Image:
-        """Render a scene as an image. Matches of prompts are highlighted. With object_number, the camera looks at that
-        object."""
+        """Render a scene as an image. Matches of prompts are highlighted. With prompts and object_number, the camera
+        looks at that object."""
         served = self._run(run)
         chosen = _selection(prompts, object_number) if len(prompts) > 0 else None
         look_at = None if chosen is None or object_number is None else _view_of(served, chosen)
@@ -120,7 +120,7 @@ class Tools:
         run: Run,
         prompts: Prompts,
         object_number: ObjectNumber = None,
-        format: Annotated[str, Field(description="ply, or masks for a ZIP file of mask images")] = "ply",
+        format: Annotated[str, Field(description="ply, glb, or masks for a ZIP file of mask images")] = "ply",
     ) -> str:
         """Write the Gaussians that match prompts, or one of the matching objects, to a new file, and return its name.
         The file is in the export folder of the server. Existing files are never replaced."""

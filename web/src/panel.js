@@ -93,7 +93,14 @@ export class Panel {
             (anchor) => this.isolate(null, this.state.objects ?? [], anchor),
             { id: "do-isolate" },
           ),
-          button("Show all", null, "Show all hidden Gaussians.", "A", simple("show_all"), { id: "do-show" }),
+          button(
+            "Show all",
+            null,
+            "Show all hidden Gaussians, except those of hidden layers.",
+            "A",
+            simple("show_all"),
+            { id: "do-show" },
+          ),
           button("Invert", null, "Select all other visible Gaussians.", "X", simple("invert"), { id: "do-invert" }),
           button("Why?", null, "Show the images that support this selection.", "W", simple("explain"), {
             id: "do-why",
@@ -101,7 +108,7 @@ export class Panel {
           button(
             "Go to",
             null,
-            "Move the camera to the largest selected object.",
+            "Move the camera to the first object in the list.",
             "G",
             (anchor) => this.goToFirst(anchor),
             { id: "do-go" },
@@ -499,7 +506,7 @@ export class Panel {
       );
     });
     const note =
-      state.more_objects > 0 ? [h("li.soft.small", {}, `and ${grouped(state.more_objects)} smaller ones`)] : [];
+      state.more_objects > 0 ? [h("li.soft.small", {}, `and ${grouped(state.more_objects)} more`)] : [];
     fill(
       $("objects"),
       rows.length ? [...rows, ...note] : [h("li.soft.small", {}, "This list shows the objects of the selection.")],

@@ -28,7 +28,7 @@ export class Search {
       tip: "Search. Separate several prompts by commas. Put a prompt that contains a comma in double quotes.",
       keys: "Enter",
     });
-    Object.assign($("cancel").dataset, { tip: "Stop searching.", keys: "Escape" });
+    Object.assign($("cancel").dataset, { tip: "Stop the search or the explanation.", keys: "Escape" });
     $("cancel").addEventListener("click", () => this.cancel());
     this.showExamples(true);
   }
