@@ -35,9 +35,9 @@ from normlift_ns.server.runs import ServedRun, without_paths
 
 _INSTRUCTIONS = """Search trained 3D scenes (Gaussian splats with semantics) by text.
 Start with list_runs. Prompts are short nouns such as "red mug". Some encoders accept only certain words; the error for
-other prompts lists the unknown words. The verdict on a prompt is found, weak match or probably not here. list_objects
-counts and locates objects, render draws them, and explain returns the training images that support a match. Positions
-are in scene units."""
+other prompts suggests words. The verdict on a prompt is found, weak match or probably not here. list_objects counts and
+locates objects, render draws them, and explain returns the training images that support a match. Positions are in scene
+units."""
 _READS = ToolAnnotations(read_only_hint=True, idempotent_hint=True, open_world_hint=False)
 _WRITES = ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False)
 _MAX_RESULT = 60_000
