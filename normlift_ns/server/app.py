@@ -63,7 +63,7 @@ _IDLE_SECONDS = 1.0
 """Seconds without a request after which the server computes data in advance."""
 _QUICK_THREADS = 4
 _THREADS = max(2, torch.get_num_threads() // 2)
-"""Number of threads for queries, and also for slower work such as explanations. Each thread uses several cores."""
+"""Number of threads for queries, and of further threads for slower work. Each thread uses several cores."""
 _HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY, "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin",

@@ -161,7 +161,7 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
             for picture in votes.pictures(dict.fromkeys(vote for group in groups.values() for vote in group)):
                 images[picture.vote.view] = _data_url(to_jpeg(picture.image.cpu().numpy(), _IMAGE_SIZE))
         except (InputError, OSError) as error:
-            problem = without_paths(f"The regions that voted cannot be outlined: {error}")
+            problem = without_paths(f"Not all regions that voted can be outlined: {error}")
             images = _plain_images(served, [vote for group in groups.values() for vote in group]) | images
 
     def entry(vote: ViewVote) -> dict[str, Any]:

@@ -366,7 +366,8 @@ def _list_votes(votes: Sequence[ViewVote], names: Sequence[str], images: dict[in
     lines = []
     for vote in votes:
         regions = "1 region" if len(vote.regions) == 1 else f"{len(vote.regions)} regions"
-        numbers = f"{vote.share:.0%} of the weight ({vote.weight:,.0f} pixels, {regions}), cosine {vote.agreement:.2f}"
+        pixels = f"{vote.weight:,.0f} pixel{'s' * (round(vote.weight) != 1)}"
+        numbers = f"{vote.share:.0%} of the weight ({pixels}, {regions}), cosine {vote.agreement:.2f}"
         if vote.disagreement >= 0.005:
             numbers += f", {vote.disagreement:.0%} of the disagreement"
         lines.append(f"{escape_mdx(clip_text(names[vote.view], 60))}: {escape_mdx(numbers)}")

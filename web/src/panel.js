@@ -1,5 +1,5 @@
 /** Panel with selection, objects, layers, history, cameras and advanced settings. */
-import { $, BY_HAND, cssColor, fill, fixed, grouped, h, throttled } from "./dom.js";
+import { $, BY_HAND, counted, cssColor, fill, fixed, grouped, h, throttled } from "./dom.js";
 import { icon } from "./icons.js";
 
 const COLORMAPS = ["viridis", "cividis", "inferno", "magma", "turbo"];
@@ -226,7 +226,7 @@ export class Panel {
       fold("advanced", "Advanced", "Negative prompts, rule, colormap, floaters and saved prompts.", this.advanced()),
     );
     $("facts").textContent =
-      `${grouped(run.num_gaussians)} Gaussians · ${grouped(run.num_views)} images` +
+      `${counted(run.num_gaussians, "Gaussian")} · ${counted(run.num_views, "image")}` +
       (run.num_left_out > 0 ? ` · ${grouped(run.num_left_out)} not drawn, to keep the browser responsive` : "");
     $("fold-cameras").addEventListener("toggle", () => this.showCameras(), { once: true });
   }
@@ -403,7 +403,7 @@ export class Panel {
       parts.push(visible === 0 ? "No visible objects selected" : `${grouped(visible)} visible`);
     if (hidden > 0) parts.push(`${grouped(hidden)} hidden`);
     if (some && state.by_hand) parts.push("by hand");
-    if (some) parts.unshift(`of ${grouped(state.total)} Gaussians`);
+    if (some) parts.unshift(`of ${counted(state.total, "Gaussian")}`);
     $("selected-more").textContent = parts.join(" · ") || "Search, or click an object.";
     $("warning").textContent = state.warning ?? "";
     for (const id of [
@@ -535,7 +535,7 @@ export class Panel {
               onclick: () => act("layer_select", { name }),
             },
             h("span", {}, name),
-            h("span.soft.small.num", {}, `${grouped(one.count)} Gaussians`),
+            h("span.soft.small.num", {}, counted(one.count, "Gaussian")),
           ),
           button(
             visible ? `Hide ${name}` : `Show ${name}`,

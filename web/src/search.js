@@ -1,5 +1,5 @@
 /** Search box with examples and answers. */
-import { $, BY_HAND, cssColor, fill, fixed, grouped, h } from "./dom.js";
+import { $, BY_HAND, counted, cssColor, fill, fixed, grouped, h } from "./dom.js";
 import { icon } from "./icons.js";
 
 export class Search {
@@ -120,7 +120,7 @@ export class Search {
     const verdict = one.verdict && one.verdict !== "found" ? one.verdict : null;
     const several = texts.length > 1;
     const tip =
-      `${grouped(one.count ?? 0)} Gaussians, best relevancy ${fixed(Math.min(1, one.relevancy ?? 0))}.` +
+      `${counted(one.count ?? 0, "Gaussian")}, best relevancy ${fixed(Math.min(1, one.relevancy ?? 0))}.` +
       (shown && !state.by_hand
         ? " Click to show all answers."
         : several || state.by_hand
