@@ -1,5 +1,5 @@
 /** Search box with examples and answers. */
-import { $, BY_HAND, counted, cssColor, fill, fixed, grouped, h } from "./dom.js";
+import { $, BY_HAND, counted, cssColor, fill, fixed, h } from "./dom.js";
 import { icon } from "./icons.js";
 
 export class Search {
