@@ -168,17 +168,20 @@ class RemoteRun:
     ) -> RemoteAnswer:
         """Compute the relevancy and the selection of every Gaussian for each prompt, as `LiftedRun.ask` does.
 
+        Args:
+            texts: Prompts; repeated ones count once.
         Raises:
             ValueError: The server rejects the query, for instance because the encoder cannot encode a prompt.
             OSError: The server does not respond.
         """
         arrays: Arrays = "safetensors"
         settings = (None if negatives is None else list(negatives), relevancy, threshold, min_reliability, refined)
-        body = self._post("query", QueryRequest(list(texts), *settings, arrays=arrays))
+        prompts = list(dict.fromkeys(texts))
+        body = self._post("query", QueryRequest(prompts, *settings, arrays=arrays))
         tensors, length = load_safetensors(body), int.from_bytes(body[:8], "little")
         metadata = json.loads(body[8 : 8 + length])["__metadata__"]
         result = msgspec.json.decode(metadata["answer"], type=QueryResult)
-        return RemoteAnswer(Question(list(texts), *settings), result, tensors["relevancy"], tensors["selected"])
+        return RemoteAnswer(Question(prompts, *settings), result, tensors["relevancy"], tensors["selected"])
 
     @check_arguments
     def objects(self, part: Part) -> ObjectsResult:
