@@ -473,7 +473,9 @@ def _bind(host: str, port: int) -> socket.socket:
             listener.close()
         else:
             return listener
-    raise InputError(f"The server found no available port, starting at port {port}. Choose another port.")
+    last = min(port + 99, 65535)
+    found = f"None of the ports from {port} to {last} is" if 0 < port < last else f"Port {port} is not"
+    raise InputError(f"{found} available. Choose another port.")
 
 
 async def _no_icon(request: Request) -> Response:

@@ -237,7 +237,7 @@ def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
 def object_under(state: State, gaussian: int) -> Bool[Tensor, " n"]:
     """Return the mask of the object that contains a Gaussian.
 
-    If an earlier step added the Gaussian with an object, the object is all Gaussians that this step added. Else, if a
+    If an earlier step added the Gaussian with an object, the result is all Gaussians that this step added. Else, if a
     prompt selects the Gaussian, the object is a connected component of the best prompt's selection, which separates
     touching objects of different prompts. Otherwise, it is the result of `SelectionContext.object_at`.
     """
