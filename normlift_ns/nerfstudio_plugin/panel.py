@@ -489,7 +489,7 @@ class SearchPanel(Controller):
         try:
             prompts = store_query(self._folder, query, replaces=replaces)
         except InputError:
-            self._offer_to_replace(query is not None)
+            self._offer_to_replace(query is not None and self._folder is not None)
             raise
         self._offer_to_replace(False)
         self.show_message(f"Saved. The run now stores {prompts} for ns-render to draw.")

@@ -155,7 +155,8 @@ def _lift_at_the_end(trainer: Trainer, step: int) -> None:
         CONSOLE.print("Error", style="bold red")
         CONSOLE.print(
             f"Training is complete and saved, but the lift at step {step} failed: {describe_error(error)[0]}\n"
-            f"To repeat the lift, run ns-normlift --load-config {shlex.quote(str(config))}",
+            "To repeat the lift, run this command, with any lift options that you gave: "
+            f"ns-normlift --load-config {shlex.quote(str(config))}",
             markup=False,
             highlight=False,
             soft_wrap=True,
