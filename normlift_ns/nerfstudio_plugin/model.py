@@ -45,11 +45,11 @@ class LazyLpips(torch.nn.Module):
         super().__init__()
         self.options = options
         self.available = True
-        """False if the weights could not be loaded."""
+        """False if the metric or its weights could not be loaded."""
         self._metric: list[torch.nn.Module] = []  # a list keeps the network out of checkpoints
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """Return the LPIPS of images [B, 3, H, W] in 0..1, or NaN and a single warning if the weights are missing."""
+        """Return the LPIPS of images [B, 3, H, W] in 0..1. If it cannot be loaded, return NaN, and warn once."""
         if self.available and not self._metric:
             from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity  # noqa: PLC0415 (slow)
 
@@ -57,7 +57,7 @@ class LazyLpips(torch.nn.Module):
                 self._metric.append(LearnedPerceptualImagePatchSimilarity(**self.options))
             except (ImportError, OSError) as error:
                 self.available = False
-                warnings.warn(f"LPIPS is skipped, because its weights cannot be loaded ({error})", stacklevel=2)
+                warnings.warn(f"LPIPS is skipped, because it cannot be loaded ({error})", stacklevel=2)
         return self._metric[0].to(image.device)(image, reference) if self.available else image.new_tensor(torch.nan)
 
 

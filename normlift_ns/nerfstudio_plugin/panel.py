@@ -127,13 +127,13 @@ def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"])
     selection = state.selection
     count, hidden = int(selection.sum()), 0 if state.hidden is None else int(state.hidden.sum())
     if state.query is None and count == 0:
-        lines.append("No query yet.")
+        lines.append("No query.")
     else:
         lines.append(f"**{count:,}** of {len(state.space):,} Gaussians selected{state.by_hand_suffix}")
     faint = int((selection & ~drawn.to(selection.device)).sum())
     counts = [(faint, "of the selected Gaussians cannot be drawn or exported (opacity below 1/255).")]
     if state.answer is not None and state.prompts_select and state.shown is None:
-        several = int((state.answer.selected.sum(dim=1) > 1).sum())
+        several = int(((state.answer.selected.sum(dim=1) > 1) & selection).sum())
         counts.append((several, f"of the selected Gaussians match{'es' * (several == 1)} several prompts."))
     counts.append((hidden, "Gaussian is hidden." if hidden == 1 else "Gaussians are hidden."))
     lines += [f"{count:,} {text}" for count, text in counts if count > 0]
@@ -270,7 +270,7 @@ def explanation_of_run(folder: Path | None, field: SemanticField | None = None) 
     @cache
     def votes() -> RecordedVotes:
         if folder is None or field is None:
-            raise InputError("The run is not stored yet, so its images are unknown. Ask again after training.")
+            raise InputError("The run is not stored yet, so its images are unknown. Press Why? again after training.")
         scene = open_scene(folder.parent / "config.yml")
         return RecordedVotes(scene, field.to("cpu"), cache_folder(folder.parent))
 
@@ -489,7 +489,7 @@ class SearchPanel(Controller):
         try:
             prompts = store_query(self._folder, query, replaces=replaces)
         except InputError:
-            self._offer_to_replace(query is not None)
+            self._offer_to_replace(query is not None and self._folder is not None)
             raise
         self._offer_to_replace(False)
         self.show_message(f"Saved. The run now stores {prompts} for ns-render to draw.")

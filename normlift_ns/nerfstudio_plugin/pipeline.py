@@ -131,8 +131,8 @@ def feature_source_of(config: TrainerConfig, device: str = "cpu") -> FeatureSour
         if options.features != "langsplat":
             raise
         raise FileNotFoundError(
-            f"{error}. Write the features there with LangSplat's preprocessing, give their folder with "
-            "--pipeline.source.features-dir, or compute features from the images with --pipeline.source.features none"
+            f"{error}. In ns-train, put pipeline.source before the option, as in --pipeline.source.features-dir. "
+            "To encode the images instead, use --pipeline.source.features none"
         ) from error
 
 
@@ -155,7 +155,8 @@ def _lift_at_the_end(trainer: Trainer, step: int) -> None:
         CONSOLE.print("Error", style="bold red")
         CONSOLE.print(
             f"Training is complete and saved, but the lift at step {step} failed: {describe_error(error)[0]}\n"
-            f"To repeat the lift, run ns-normlift --load-config {shlex.quote(str(config))}",
+            "To repeat the lift, run this command, with any lift options that you gave: "
+            f"ns-normlift --load-config {shlex.quote(str(config))}",
             markup=False,
             highlight=False,
             soft_wrap=True,

@@ -55,7 +55,7 @@ MAX_PAGES = 64
 """Maximum number of open pages."""
 MAX_CONNECTIONS = 512
 REQUEST_TIMEOUT = 120.0
-"""Maximum duration of a request in seconds; the server then responds with status 504."""
+"""Maximum duration of a request in seconds, after which the server responds with status 504."""
 _HEADER_TIMEOUT, _BODY_TIMEOUT, _KEEP_ALIVE = 10.0, 20.0, 20
 _MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
 _TRIM_INTERVAL = 2.0
@@ -63,7 +63,7 @@ _IDLE_SECONDS = 1.0
 """Seconds without a request after which the server computes data in advance."""
 _QUICK_THREADS = 4
 _THREADS = max(2, torch.get_num_threads() // 2)
-"""Number of threads for queries, and also for slower work such as explanations. Each thread uses several cores."""
+"""Number of threads for queries, and of further threads for slower work. Each thread uses several cores."""
 _HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY, "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin",
@@ -141,11 +141,11 @@ class Guard:
                 await self._app(scope, _limited(receive), send_with_headers)
         except TimeoutError:
             if not started:
-                await JSONResponse(
-                    {"error": "The request exceeded the time limit. Try fewer prompts or a smaller image."},
-                    504,
-                    _HEADERS,
-                )(scope, receive, send)
+                text = (
+                    f"The request took longer than the limit of {REQUEST_TIMEOUT:g} seconds. Requests with fewer "
+                    "prompts or smaller images take less time."
+                )
+                await JSONResponse({"error": text}, 504, _HEADERS)(scope, receive, send)
         return None
 
 
@@ -183,15 +183,18 @@ class _PromptProtocol(H11Protocol):
 
 
 def _limited(receive: Receive) -> Receive:
-    """Wrap `receive` to raise HTTPException if the body is too large, and TimeoutError if it arrives too slowly."""
+    """Wrap `receive` to raise HTTPException if the body is too large or arrives too slowly."""
     total = 0
 
     async def limited() -> Message:
         nonlocal total
         if total < 0:
             return await receive()
-        with anyio.fail_after(_BODY_TIMEOUT):
-            message = await receive()
+        try:
+            with anyio.fail_after(_BODY_TIMEOUT):
+                message = await receive()
+        except TimeoutError:
+            raise HTTPException(408, "The request body did not arrive in time. Send the request again.") from None
         if message["type"] == "http.request":
             total += len(message.get("body", b""))
             if total > MAX_BODY:
@@ -414,7 +417,7 @@ class WarmServer:
         For port 0, the operating system chooses a free port.
 
         Raises:
-            InputError: If neither the port nor one of the 99 ports after it is available.
+            InputError: If neither the port nor any of the 99 ports after it is available.
         """
         listener = _bind(self.options.host, self.options.port)
         config = uvicorn.Config(
@@ -443,7 +446,8 @@ async def _close(websocket: WebSocket, error: BaseException) -> None:
     """Close a WebSocket with the message of an error as the reason, unless it is closed already."""
     while isinstance(getattr(error, "exceptions", None), tuple):
         error = error.exceptions[0]  # type: ignore[attr-defined]
-    reason = without_paths(describe_error(error)[0]) if not isinstance(error, TimeoutError) else "no greeting"
+    late = isinstance(error, TimeoutError)
+    reason = "The page started too slowly." if late else without_paths(describe_error(error)[0])
     try:
         await websocket.close(1008 if isinstance(error, InputError | TimeoutError) else 1011, reason[:120])
     except RuntimeError:  # already closed
@@ -469,7 +473,9 @@ def _bind(host: str, port: int) -> socket.socket:
             listener.close()
         else:
             return listener
-    raise InputError(f"--port {port} and the ports after it are not available. Give another port.")
+    last = min(port + 99, 65535)
+    found = f"None of the ports from {port} to {last} is" if 0 < port < last else f"Port {port} is not"
+    raise InputError(f"{found} available. Choose another port.")
 
 
 async def _no_icon(request: Request) -> Response:

@@ -78,7 +78,9 @@ class RemoteAnswer:
             KeyError: `text` is not a prompt of this answer.
         """
         if text not in self.texts:
-            raise KeyError(f"{text!r} is not a prompt of this answer; its prompts are {', '.join(self.texts)}")
+            raise KeyError(
+                f"{text!r} is not a prompt of this answer; its prompts are {', '.join(map(repr, self.texts))}"
+            )
         return RemoteFinding(self, self.texts.index(text))
 
     def __repr__(self) -> str:
@@ -166,17 +168,20 @@ class RemoteRun:
     ) -> RemoteAnswer:
         """Compute the relevancy and the selection of every Gaussian for each prompt, as `LiftedRun.ask` does.
 
+        Args:
+            texts: Prompts; repeated ones count once.
         Raises:
             ValueError: The server rejects the query, for instance because the encoder cannot encode a prompt.
             OSError: The server does not respond.
         """
         arrays: Arrays = "safetensors"
         settings = (None if negatives is None else list(negatives), relevancy, threshold, min_reliability, refined)
-        body = self._post("query", QueryRequest(list(texts), *settings, arrays=arrays))
+        prompts = list(dict.fromkeys(texts))
+        body = self._post("query", QueryRequest(prompts, *settings, arrays=arrays))
         tensors, length = load_safetensors(body), int.from_bytes(body[:8], "little")
         metadata = json.loads(body[8 : 8 + length])["__metadata__"]
         result = msgspec.json.decode(metadata["answer"], type=QueryResult)
-        return RemoteAnswer(Question(list(texts), *settings), result, tensors["relevancy"], tensors["selected"])
+        return RemoteAnswer(Question(prompts, *settings), result, tensors["relevancy"], tensors["selected"])
 
     @check_arguments
     def objects(self, part: Part) -> ObjectsResult:
@@ -220,7 +225,9 @@ class RemoteRun:
 
     @check_arguments
     def features(self, start: int = 0, stop: int | None = None) -> Float[Tensor, "m d"]:
-        """Return the unit features of the Gaussians `start` to `stop` - 1 (default: all), or 0 without a direction.
+        """Return the unit features of the Gaussians `start` to `stop` - 1 (default: all).
+
+        Gaussians without a direction have zeros.
 
         Raises:
             ValueError: The range is not valid, or has more than 131,072 Gaussians.
@@ -308,8 +315,8 @@ class RemoteRun:
             matches = [one for one in cameras if view in (one["name"], Path(one["name"]).name, Path(one["name"]).stem)]
         if len(matches) != 1:
             raise InputError(
-                f"view must be the name or index of one of {len(cameras)} training images; {len(matches)} images match "
-                f"{view!r}"
+                f"view must be the name or index of one training image; {view!r} matches {len(matches) or 'none'} of "
+                f"{len(cameras)}"
             )
         found = matches[0]
         pose, K = torch.tensor(found["world_to_camera"]), torch.tensor(found["K"])
@@ -335,8 +342,8 @@ class RemoteRun:
             except (http.client.HTTPException, OSError) as error:
                 self._close()
                 raise ConnectionError(
-                    f"The server at {self.address} does not respond ({error}). Check the address, or start the server "
-                    "with: ns-normlift-serve"
+                    f"The server at {self.address} does not respond ({error}). Check the address, and check that "
+                    "ns-normlift-serve or ns-normlift-view is running there."
                 ) from error
         if status != 200:
             raise InputError(f"The server at {self.address} answered with status {status}: {_reason(content)}")
@@ -387,7 +394,8 @@ def _selection(part: Any) -> Selection:
     if isinstance(part, Selection):
         return part
     raise InputError(
-        f"part must be an answer from the server, its result for one prompt, or a mask; got {type(part).__name__}"
+        "part must be an answer from the server, its result for one prompt, a one-dimensional boolean mask or a "
+        f"Selection; got {type(part).__name__}"
     )
 
 
@@ -398,7 +406,7 @@ def connect(url: str, run: str | None = None, *, access_token: str = "") -> Remo
     Args:
         url: Address of the server, such as http://localhost:7008.
         run: Id of the run (default: the only run of the server).
-        access_token: Token printed by the server; needed to store prompts from another machine.
+        access_token: Token printed by the server; needed to store prompts unless the server listens on localhost only.
     Raises:
         ValueError: The address is not valid, or the server does not have this run.
         OSError: The server does not respond.
@@ -409,9 +417,14 @@ def connect(url: str, run: str | None = None, *, access_token: str = "") -> Remo
     ...     print(error)
     url must be the address of a server such as http://localhost:7008, got 'ftp://localhost'
     """
-    parts = urlsplit(url if "://" in url else f"http://{url}")
+    wrong = InputError(f"url must be the address of a server such as http://localhost:7008, got {url!r}")
+    try:
+        parts = urlsplit(url if "://" in url else f"http://{url}")
+        _ = parts.port
+    except ValueError:  # the port is not a number, or the brackets of an IPv6 address do not match
+        raise wrong from None
     if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise InputError(f"url must be the address of a server such as http://localhost:7008, got {url!r}")
+        raise wrong
     remote = RemoteRun(f"{parts.scheme}://{parts.netloc}", run or "", access_token)
     ids = [one["id"] for one in json.loads(remote._get("/api/runs"))["runs"]]
     if run is None and len(ids) == 1:

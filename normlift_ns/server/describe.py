@@ -47,7 +47,7 @@ def region_mask(served: ServedRun, state: State, value: protocol.Region | protoc
     drawn = state.drawn & served.visible
     mask &= visible_gaussians(scene.gaussians, camera, drawn, rasterize_mode=scene.rasterize_mode)
     if not bool(mask.any()):
-        raise InputError("This region has no visible Gaussians. Draw a larger region.")
+        raise InputError("This region has no visible Gaussians. Choose another region.")
     return mask
 
 
@@ -126,7 +126,7 @@ def object_json(state: State, number: int, row: ObjectRow) -> dict[str, Any]:
 def describe_hover(
     served: ServedRun, state: State, value: protocol.Ray, objects: Sequence[tuple[int, ObjectRow]]
 ) -> dict[str, Any] | None:
-    """Describe the Gaussian with the largest weight on the ray of the pointer; return None if the ray hits none."""
+    """Describe the Gaussian that `pick_gaussian` finds on the ray of the pointer; return None if it finds none."""
     with suppress(InputError):
         gaussian = actions.pick_gaussian(state, served.weights(value.origin, value.direction))
         position, answer = state.space.means[gaussian].double().cpu(), state.answer
@@ -161,18 +161,19 @@ def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
             for picture in votes.pictures(dict.fromkeys(vote for group in groups.values() for vote in group)):
                 images[picture.vote.view] = _data_url(to_jpeg(picture.image.cpu().numpy(), _IMAGE_SIZE))
         except (InputError, OSError) as error:
-            problem = without_paths(f"The regions that voted cannot be outlined: {error}")
+            problem = without_paths(f"Not all regions that voted can be outlined: {error}")
             images = _plain_images(served, [vote for group in groups.values() for vote in group]) | images
 
     def entry(vote: ViewVote) -> dict[str, Any]:
         facts = {"share": vote.share, "agreement": vote.agreement, "disagreement": vote.disagreement}
         return {"name": votes.names[vote.view], "url": images.get(vote.view), "regions": len(vote.regions), **facts}
 
-    changed, count = _CHANGED.format(why.changed) if why.changed > 0 else "", max(1, round(why.n_eff))
+    changed, count = _CHANGED.format(why.changed) if why.changed >= 0.005 else "", max(1, round(why.n_eff))
     facts = {"agreement": why.c_inter, "effective_views": why.n_eff, "problem": problem}
     facts |= {"name": state.name, "selected": why.gaussians}
     votes_of = {name: [entry(vote) for vote in group] for name, group in groups.items()}
-    return {"text": f"Based on about {count} image{'s' * (count > 1)}{changed}.", **facts, **votes_of}
+    text = f"Based on about {count} image{'s' * (count > 1)}{changed}." if len(why.views) > 0 else why.words
+    return {"text": text, **facts, **votes_of}
 
 
 def _plain_images(served: ServedRun, votes: Sequence[ViewVote]) -> dict[int, str]:

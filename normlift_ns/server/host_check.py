@@ -58,7 +58,7 @@ def refuse_request(hosts: Sequence[str], origins: Sequence[str], names: frozense
     >>> names = accepted_names("127.0.0.1")
     >>> refuse_request(["localhost:8000"], ["http://localhost:8000"], names)
     >>> refuse_request(["localhost:7008"], ["https://example.org"], names)
-    'A page of https://example.org may not use the server at localhost:7008.'
+    'A page with the origin https://example.org may not use the server at localhost:7008.'
     """
     host = _authority(hosts[0]) if len(hosts) == 1 else None
     if host is None:
@@ -75,7 +75,7 @@ def refuse_request(hosts: Sequence[str], origins: Sequence[str], names: frozense
     if len(origins) > 1 or page is None or default is None or (page[1] or default, page[0]) != (
         host[1] or default, host[0],
     ):  # fmt: skip
-        return f"A page of {short_repr(origins[0])[1:-1]} may not use the server at {hosts[0]}."
+        return f"A page with the origin {short_repr(origins[0])[1:-1]} may not use the server at {hosts[0]}."
     return None
 
 

@@ -31,8 +31,8 @@ MAX_FEATURES = 2**17
 T = TypeVar("T")
 _BINARY = "application/octet-stream"
 _MAY_NOT_WRITE = (
-    "This request may not write into the run: the server is read-only, or the header Authorization: Bearer TOKEN lacks "
-    "the access token"
+    "This request may not write into the run: the server is read-only, or the request lacks the header Authorization: "
+    "Bearer TOKEN with the access token."
 )
 
 
@@ -123,7 +123,8 @@ def _camera(served: ServedRun, request: schema.RenderRequest) -> Camera:
     if request.page_view is not None:
         if not request.page_view.is_valid:
             raise InputError(
-                "page_view is not valid: look_at must differ from position, and the view must not be parallel to up."
+                "page_view is not valid: look_at must differ from position, up must not be zero, and the viewing "
+                "direction must not be parallel to up."
             )
         return request.page_view.camera(request.max_size)
     camera = served.run.camera(request.view) if request.camera is None else request.camera.camera()
@@ -207,8 +208,8 @@ ENDPOINTS = (
     Endpoint("select", "Return the size and position of a selection, or its mask.", schema.SelectRequest,
              schema.SelectResult, select, slow=False),
     Endpoint("render", "Render the scene, a selection or an object as JPEG.", schema.RenderRequest, None, render),
-    Endpoint("export", "Return a selection as a file. The format is ply, or masks for a ZIP file of mask images.",
-             schema.ExportRequest, None, export),
+    Endpoint("export", "Return a selection or the whole scene as a file. The format is ply, another splat format such "
+             "as glb, or masks for a ZIP file of mask images.", schema.ExportRequest, None, export),
     Endpoint("save", "Store prompts in the run.", schema.SaveRequest, dict[str, str], save, writes=True),
     Endpoint("floaters", "Find likely floaters, which are Gaussians that are not part of a surface.", None,
              schema.SelectResult, floaters, parameters=("arrays",)),

@@ -35,9 +35,9 @@ from normlift_ns.server.runs import ServedRun, without_paths
 
 _INSTRUCTIONS = """Search trained 3D scenes (Gaussian splats with semantics) by text.
 Start with list_runs. Prompts are short nouns such as "red mug". Some encoders accept only certain words; the error for
-other prompts lists the unknown words. The verdict on a prompt is found, weak match or probably not here. list_objects
-counts and locates objects, render draws them, and explain returns the training images that support a match. Positions
-are in scene units."""
+other prompts suggests words. The verdict on a prompt is found, weak match or probably not here. list_objects counts and
+locates objects, render draws them, and explain returns the training images that support a match. Positions are in scene
+units."""
 _READS = ToolAnnotations(read_only_hint=True, idempotent_hint=True, open_world_hint=False)
 _WRITES = ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False)
 _MAX_RESULT = 60_000
@@ -95,8 +95,8 @@ class Tools:
         isolate: Annotated[bool, Field(description="Draw only the matches")] = False,
         mode: ColorMode = "overlay",
     ) -> Image:
-        """Render a scene as an image. Matches of prompts are highlighted. With object_number, the camera looks at that
-        object."""
+        """Render a scene as an image. Matches of prompts are highlighted. With prompts and object_number, the camera
+        looks at that object."""
         served = self._run(run)
         chosen = _selection(prompts, object_number) if len(prompts) > 0 else None
         look_at = None if chosen is None or object_number is None else _view_of(served, chosen)
@@ -120,7 +120,7 @@ class Tools:
         run: Run,
         prompts: Prompts,
         object_number: ObjectNumber = None,
-        format: Annotated[str, Field(description="ply, or masks for a ZIP file of mask images")] = "ply",
+        format: Annotated[str, Field(description="ply, glb, or masks for a ZIP file of mask images")] = "ply",
     ) -> str:
         """Write the Gaussians that match prompts, or one of the matching objects, to a new file, and return its name.
         The file is in the export folder of the server. Existing files are never replaced."""

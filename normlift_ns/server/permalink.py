@@ -58,7 +58,7 @@ class Link(msgspec.Struct, frozen=True, omit_defaults=True):
     clicks: dict[str, Annotated[int, msgspec.Meta(ge=0)]] = {}
     """Indices of clicked Gaussians, by the prompt texts that stand for the clicks."""
     threshold: Finite | None = None
-    """Threshold that the user chose; None for the default."""
+    """Threshold that the user chose, or that of a query of clicks alone; None for the default."""
     min_reliability: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
     look: str = "overlay"
     """Color mode."""

@@ -1,6 +1,6 @@
 """Messages between a page and the server: actions and the types of their values, and the colors of a state.
 
-Colors are sent as a palette and one byte per drawn Gaussian, its index in the palette.
+Colors are sent as a palette and one byte per Gaussian of the page: its index in the palette, or `NOT_DRAWN`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from normlift_ns.session.state import State
 
 ColorMode = Literal["overlay", "heat", "prompts", "reliability", "rgb", "pca"]
 """Coloring of the scene. overlay: selected Gaussians in the color of their best prompt, stronger for higher relevancy.
-prompts: the same at full strength. heat: relevancy of all Gaussians in a colormap. reliability: R in a colormap from
-0 to 1. rgb: trained colors. pca: three principal components of the features as RGB."""
+prompts: the same at full strength. heat: relevancy of all Gaussians with a direction, in a colormap. reliability: R in
+a colormap from 0 to 1. rgb: trained colors. pca: three principal components of the features as RGB."""
 COLOR_MODES: tuple[ColorMode, ...] = get_args(ColorMode)
 Text = Annotated[str, msgspec.Meta(max_length=4000)]
 Texts = Annotated[list[Text], msgspec.Meta(max_length=64)]
@@ -199,7 +199,7 @@ def decode(text: str | bytes | msgspec.Raw, kind: Any) -> Any:
 
 
 NOT_DRAWN = 255
-"""Code of Gaussians that are not drawn. All other codes are indices in the palette."""
+"""Code of Gaussians that the user has hidden. All other codes are indices in the palette."""
 BY_HAND_COLOR: RGB = (1.0, 0.75, 0.1)
 _OWN, _GRAY = 0, 1
 """Codes of the trained color, and of its dimmed gray value."""
@@ -215,7 +215,7 @@ _PCA_QUANTILES = (0.02, 0.98)
 
 
 class Codes(NamedTuple):
-    """Colors of M drawn Gaussians: a palette, and the index of each Gaussian in it."""
+    """Colors of M Gaussians: a palette, and the code of each Gaussian, which is an index in it or `NOT_DRAWN`."""
 
     palette: list[tuple[int, int, int, float, int]]
     """Red, green and blue in 0..255, the opacity of this color, and the color under it (0: trained color, 1: gray).
@@ -257,7 +257,7 @@ def prompt_display_colors(state: State) -> list[RGB]:
 
 
 def legend(state: State) -> dict[str, Any] | None:
-    """Return the end values, label and colors of the color scale of a state; None if its mode has no scale."""
+    """Return the end values, label and colors of the color scale of a state; None if it has no scale."""
     if state.color_mode == "reliability":
         low, high, label, colors = 0.0, 1.0, "reliability R", _colormap(RELIABILITY_COLORMAP)
     elif state.answer is None or not state.prompts_select or state.color_mode not in ("overlay", "heat"):

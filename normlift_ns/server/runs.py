@@ -255,7 +255,7 @@ class ServedRun:
         """Return the name and content of a file of Gaussians, and a message for the user; see `selection_bytes`."""
         file, content = selection_bytes(self.run.scene, self.run.field, state, mask, name, kind)
         faint = int((mask & ~self.visible).sum())
-        note = f" Left out, because they are too faint to see (opacity below 1/255): {faint:,}." if faint > 0 else ""
+        note = f" Left out (opacity below 1/255, or not valid for drawing): {faint:,}." if faint > 0 else ""
         return file, content, f"Downloaded {file}. Gaussians: {int(mask.sum()) - faint:,}.{note}"
 
     def cached(self, key: bytes, compute: Callable[[], T], size: Callable[[T], int] = lambda result: 0) -> T:
@@ -289,9 +289,7 @@ class ServedRun:
         """
         view = view or self.first_view
         if view is None:
-            raise InputError(
-                "No camera is known, and the run has no training images. Move the camera of the page, and try again."
-            )
+            raise InputError("The run has no training images, so the initial camera is unknown.")
         scene = self.run.scene.gaussians
         position = unoccluded_viewpoint(target, scene, drawn, view.position, view.up, view.fov)
         return msgspec.structs.replace(view, position=position, look_at=tuple(target.center))
@@ -379,13 +377,16 @@ def to_jpeg(image: UInt8[np.ndarray, "h w 3"], max_size: int | None = None) -> b
 
 
 class RunStore:
-    """Store of runs by id. It opens runs on first use, and closes the least recently used ones above a memory limit.
+    """Store of runs by id. It opens runs on first use.
+
+    Above a memory limit, it closes the least recently used runs that have no open page.
 
     Args:
         configs: Paths of the runs' config.yml files.
         open_run: Function that opens the run of a config.yml.
         max_gaussians: As in `ServedRun`.
-        memory_limit: Maximum size of all open runs in bytes (default: half of the free memory).
+        memory_limit: Total size of the open runs, in bytes, above which runs are closed (default: half of the free
+            memory).
     """
 
     def __init__(

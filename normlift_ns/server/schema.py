@@ -278,9 +278,9 @@ def find_object(state: State, number: int) -> ObjectRow:
         ValueError: The list has no object with this number.
     """
     objects = list_objects(state, max_objects=MAX_OBJECTS).objects
-    if number > len(objects):
-        found = f"{len(objects)} object{'s' * (len(objects) != 1)}"
-        raise InputError(f"The list has no object {number}. It has {found}, numbered from 1.")
+    if not 1 <= number <= len(objects):
+        found = f"has {len(objects)} object{'s' * (len(objects) != 1)}, numbered from 1" if objects else "is empty"
+        raise InputError(f"The list has no object {number}. It {found}.")
     return objects[number - 1]
 
 
@@ -299,7 +299,8 @@ def unpack_mask(packed: bytes, count: int) -> torch.Tensor:
     [True, False, True]
     """
     if len(packed) != (count + 7) // 8:
-        raise InputError(f"The mask has {len(packed):,} bytes; expected {(count + 7) // 8:,} for {count:,} Gaussians.")
+        expected = f"expected {(count + 7) // 8:,}, with one bit for each Gaussian"
+        raise InputError(f"The number of bytes of the mask is {len(packed):,}; {expected}.")
     return torch.from_numpy(np.unpackbits(np.frombuffer(packed, np.uint8), count=count).astype(bool))
 
 

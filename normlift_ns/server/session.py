@@ -398,7 +398,7 @@ class PageSession:
         row = None if value.object is None else self._object(value.object)
         mask, name = (state.selection, state.name) if row is None else (row.mask, row.name)
         if not bool(mask.any()):
-            raise InputError("Nothing is selected. First select the Gaussians to export.")
+            raise InputError("Nothing is selected, so there is nothing to export.")
 
         async def work() -> None:
             try:
@@ -414,8 +414,8 @@ class PageSession:
     async def _save(self, pending: _Pending) -> None:
         if self._read_only:
             raise InputError(
-                "This page may not store prompts in the run. Start the server without --read-only, or open the address "
-                "with the access token that the server prints."
+                "This page may not store prompts in the run: the server is read-only, or the page's address lacks the "
+                "access token printed by the server."
             )
         replaces = pending.value is not None and pending.value.replace
         store = partial(self._run.save, self._state.query, replaces=replaces)
@@ -426,7 +426,7 @@ class PageSession:
         """Move the camera close to an object or a position, with little occlusion if possible."""
         value = pending.value
         if value.id is None and value.position is None:
-            raise InputError("The action go_to needs the id of an object or a position.")
+            raise InputError("The action go_to needs a position or the id of an object.")
         spot = LookAtTarget(value.position or (0.0, 0.0, 0.0), _SPOT * self._run.frame[2])
         target = spot if value.id is None else self._object(value.id)
         find = partial(self._run.view_of, target, self._memory.view, self._state.drawn)
@@ -526,9 +526,7 @@ class PageSession:
             try:
                 view = self._memory.view or self._run.first_view
                 if view is None:
-                    raise InputError(
-                        "No camera is known, and the run has no training images. Move the camera, and try again."
-                    )
+                    raise InputError("The run has no training images, so the initial camera is unknown.")
                 camera = view.camera(pending.value.max_size)
                 draw = partial(self._still, state, camera, pending.value.background)
                 jpeg = await self._in_thread(draw, self._limits.slow)

@@ -33,8 +33,8 @@ class PromptDiagnostics:
     """Histogram of the relevancies of the prompt."""
     warning: str
     """Warning about the prompt; empty if there is none, and for clicks. If the encoder ignores some words, the warning
-    lists those that it uses. If the verdict is "weak match" or "probably not here", or no Gaussian is selected, the
-    warning has the largest relevancy and its position."""
+    lists those that it uses. If the verdict is "weak match" or "probably not here", the warning has the largest
+    relevancy and its position. Otherwise, if no Gaussian is selected, it names the setting to change."""
     nearest_position: tuple[float, float, float] | None = None
     """Position of the largest relevancy, if there is a warning; see `Finding.nearest`."""
 
@@ -230,14 +230,14 @@ def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
     weights = weights.where(state.space.field.valid(refined=state.refined) & state.drawn, 0.0)
     index = int(weights.argmax()) if len(weights) > 0 else 0
     if len(weights) == 0 or not float(weights[index]) > 0:
-        raise InputError("This position has no Gaussian with semantics. Click a visible object.")
+        raise InputError("This position has no Gaussian with semantics. Choose another position.")
     return index
 
 
 def object_under(state: State, gaussian: int) -> Bool[Tensor, " n"]:
     """Return the mask of the object that contains a Gaussian.
 
-    If an earlier click added the Gaussian, the object consists of all Gaussians that this click added. Else, if a
+    If an earlier step added the Gaussian with an object, the result is all Gaussians that this step added. Else, if a
     prompt selects the Gaussian, the object is a connected component of the best prompt's selection, which separates
     touching objects of different prompts. Otherwise, it is the result of `SelectionContext.object_at`.
     """
@@ -374,7 +374,7 @@ def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
-        raise InputError("Nothing is selected. First select the Gaussians to isolate.")
+        raise InputError("Nothing is selected, so there is nothing to isolate.")
     return replace(state, hidden=~chosen, action=f"Only {int(chosen.sum()):,}")
 
 

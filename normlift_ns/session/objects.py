@@ -24,7 +24,7 @@ _BY_HAND_COLOR = (1.0, 0.75, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class ObjectRow:
-    """One object, a connected component of the Gaussians that one prompt selects or that are selected by hand."""
+    """One object of a selection; see `list_objects`."""
 
     text: str
     """The prompt, or "selected by hand"."""
@@ -73,7 +73,8 @@ class ObjectList:
 def list_objects(state: State, *, max_objects: int = 12, min_gaussians: int = OBJECT_MIN_GAUSSIANS) -> ObjectList:
     """Return the objects among the selected and drawn Gaussians, for each prompt or for a selection made by hand.
 
-    An object that was selected or added by hand stays one object, unless the selection was grown or shrunk.
+    Objects are connected components. An object that was selected or added by hand stays one object, unless the
+    selection was grown or shrunk.
 
     Args:
         max_objects: Maximum number of listed objects; the largest object of each prompt has priority.

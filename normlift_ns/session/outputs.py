@@ -32,9 +32,9 @@ def store_query(folder: Path | None, query: Query | None, *, replaces: bool = Fa
         ValueError: The query or the folder is missing, or `merge_queries` cannot merge the queries.
     """
     if query is None:
-        raise InputError("This session has no query yet, so it has no prompts to save. Type a prompt and press Ask.")
+        raise InputError("This session has no query, so it has no prompts to save. Type a prompt and press Ask.")
     if folder is None:
-        raise InputError("The run is not stored yet, so it cannot store prompts. Save the prompts after the training.")
+        raise InputError("The run is not stored yet, so it cannot store prompts. Save the prompts after training.")
     merged = merge_queries(None if replaces else load_query(folder), query)
     save_query(folder, merged)
     return "one prompt" if len(merged.texts) == 1 else f"{len(merged.texts)} prompts"
@@ -61,10 +61,11 @@ def selection_bytes(
         name: Name of the selection.
         kind: Name of an exporter that writes one file, or "masks" for a ZIP file with a mask for each training image.
     Raises:
-        ValueError: The mask has no Gaussian that a renderer draws, or the exporter does not exist or writes a folder.
+        ValueError: The mask has no Gaussian that a renderer draws, or no exporter of this name writes a single file of
+            Gaussians.
     """
     if not bool(mask.any()):
-        raise InputError("Nothing is selected. First select the Gaussians to export.")
+        raise InputError("Nothing is selected, so there is nothing to export.")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / safe_file_name(name)
         if kind == "masks":
@@ -74,8 +75,8 @@ def selection_bytes(
                     archive.write(file, file.relative_to(path))
             return f"{path.name}_masks.zip", buffer.getvalue()
         exporter = EXPORTERS.load(kind)
-        if exporter.suffix == "":
-            raise InputError(f"The format {kind} writes a folder, which cannot be downloaded. Choose ply or masks.")
+        if exporter.suffix == "" or kind == "cloud":  # a folder, or a copy of another point cloud
+            raise InputError(f"The format {kind} cannot be downloaded. Choose ply or masks.")
         path = path.with_name(path.name + exporter.suffix)
         exporter.write(ExportJob(scene, field, mask, state.answer), path)
         return path.name, path.read_bytes()

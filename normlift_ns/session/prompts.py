@@ -19,6 +19,7 @@ MAX_PROMPTS = 64
 CLICK_THRESHOLD = 0.9
 """Minimum cosine between the directions of a clicked Gaussian and a similar one."""
 _CLICK = re.compile(r"like (what was clicked|click \d+)")
+_NO_PROMPT = "There is no prompt to search for. Give at least one prompt."
 _CLICK_RULE = "Clicks need the rule cosine. Choose the rule cosine, or ask for clicks without other prompts."
 EncodeTexts = Callable[[Sequence[str]], Any]
 """Function from texts to vectors [Q, D], such as an encoder's `rows`. It raises ValueError if it cannot encode a text.
@@ -68,7 +69,7 @@ def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any
     """
     texts, vectors = split_prompts(text), dict(known_vectors or {})
     if len(texts) == 0:
-        raise InputError("Type a prompt, then press Ask.")
+        raise InputError(_NO_PROMPT)
     if len(texts) > MAX_PROMPTS:
         raise InputError(f"There are {len(texts)} prompts; the maximum is {MAX_PROMPTS} at a time. Remove some.")
     new, errors = [one for one in texts if one not in vectors], {}
@@ -123,7 +124,7 @@ def build_query(
     rows = tuple(prompts)
     clicks = [prompt.is_click for prompt in rows if prompt.vector is not None]
     if len(clicks) == 0:
-        raise InputError(rows[0].error if len(rows) > 0 else "Type a prompt, then press Ask.")
+        raise InputError(rows[0].error if len(rows) > 0 else _NO_PROMPT)
     if all(clicks):
         negatives, relevancy, threshold = (), "cosine", "auto" if threshold is None else threshold
     options = {"negatives": negatives, "relevancy": relevancy, "threshold": threshold}

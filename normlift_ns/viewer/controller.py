@@ -21,7 +21,9 @@ from normlift_ns.session.prompts import build_query, click_name, encode_prompts,
 from normlift_ns.session.state import History, RequestToken, RequestTokens, State
 from normlift_ns.viewer.widgets import ALL_PROMPTS, SLIDERS, Action, Explanation
 
-NO_FIELD_MESSAGE = "This scene has no semantics yet. The lift runs at the end of training."
+NO_FIELD_MESSAGE = (
+    "This scene has no semantics yet. They are added by ns-normlift, or by the lift at the end of training."
+)
 _CLICK_MODES: dict[Action, ClickMode] = {Action.SELECT: "select", Action.ADD: "add", Action.REMOVE: "remove"}
 
 

@@ -202,7 +202,7 @@ class ObjectRows:
     def show(self, object_list: ObjectList) -> None:
         """Replace the listed objects; at most `MAX_OBJECT_ROWS` are shown."""
         self._objects, small = tuple(object_list.objects), object_list.in_smaller_parts
-        unlisted = [f"Smaller objects that are not listed: {object_list.left_out:,}"] * (object_list.left_out > 0)
+        unlisted = [f"Objects that are not listed: {object_list.left_out:,}"] * (object_list.left_out > 0)
         unlisted += [f"Gaussians in components too small to be objects: {small:,}"] * (small > 0)
         empty = "" if len(self._objects) > 0 else "No visible objects selected"
         self._summary.content = escape_mdx("; ".join(unlisted) or empty)
@@ -340,7 +340,7 @@ _explain_lock = Lock()
 def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refined: bool = True) -> str:
     """Return the agreement of the images as text, and the images with outlines of the regions that voted, as MDX.
 
-    If the images cannot be shown, for instance because features were passed from Python, the text gives the reason.
+    If an image cannot be shown, for instance because features were passed from Python, the text gives the reason.
 
     Raises:
         ValueError: Nothing is selected, or the votes are not in the cache.
@@ -353,7 +353,7 @@ def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refin
         for picture in votes.pictures(dict.fromkeys((*heaviest, *different))):
             images[picture.vote.view] = image_mdx(picture.image)
     except (InputError, OSError) as error:
-        problem = f"The images cannot be shown: {error}"
+        problem = f"Not all images can be shown: {error}"
     lines = [escape_mdx(why.sentence), *filter(None, [escape_mdx(clip_text(problem, 400))])]
     for title, view_votes in (("Strongest support:", heaviest), ("Images that disagree:", different)):
         if len(view_votes) > 0:
@@ -366,7 +366,8 @@ def _list_votes(votes: Sequence[ViewVote], names: Sequence[str], images: dict[in
     lines = []
     for vote in votes:
         regions = "1 region" if len(vote.regions) == 1 else f"{len(vote.regions)} regions"
-        numbers = f"{vote.share:.0%} of the weight ({vote.weight:,.0f} pixels, {regions}), cosine {vote.agreement:.2f}"
+        pixels = f"{vote.weight:,.0f} pixel{'s' * (round(vote.weight) != 1)}"
+        numbers = f"{vote.share:.0%} of the weight ({pixels}, {regions}), cosine {vote.agreement:.2f}"
         if vote.disagreement >= 0.005:
             numbers += f", {vote.disagreement:.0%} of the disagreement"
         lines.append(f"{escape_mdx(clip_text(names[vote.view], 60))}: {escape_mdx(numbers)}")

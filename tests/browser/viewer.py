@@ -34,7 +34,7 @@ class Tab(Person):
     def fresh(self) -> None:
         """Takes back what was done before in any tab, but for what is stored."""
         self.press("Clear")
-        self.until(lambda: "No query yet" in self.text() and self.typed("Prompts") == "", "cleared")
+        self.until(lambda: "No query" in self.text() and self.typed("Prompts") == "", "cleared")
         self.show("rgb")
 
     def arm(self, button: str) -> None:

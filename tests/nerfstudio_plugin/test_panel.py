@@ -257,7 +257,7 @@ def test_clear_leaves_nothing_behind(panel: Any, pipeline: Any) -> None:
     panel.act(Action("More like this"), client=(browser := Browser()))
     panel.act(Action("Clear"))
     assert {name: getattr(widgets, name).value for name in settings} == before
-    assert (widgets.prompts.value, said(panel).strip()) == ("", "No query yet.")
+    assert (widgets.prompts.value, said(panel).strip()) == ("", "No query.")
     assert panel.answer is pipeline.model._display.drawn is browser._scene_pointer_cb is None
     panel.act(Action("Use suggested"))
     assert "threshold" in said(panel) and not chosen(pipeline).any()
@@ -513,4 +513,4 @@ def test_a_panel_waits_for_a_field(pipeline: Any) -> None:
         assert "semantics yet" in said(panel), name
     pipeline.model.attach(field)
     assert not panel._widgets.ask.disabled
-    assert said(panel).strip() == "No query yet."
+    assert said(panel).strip() == "No query."

@@ -199,7 +199,7 @@ def test_a_slow_body_and_slow_work_end(monkeypatch, tmp_path):
     monkeypatch.setattr(app_module, "REQUEST_TIMEOUT", 1.0)
     monkeypatch.setattr(served, "read", lambda texts: go.wait(60))
     with running(make_server(served, port=0)) as port:
-        for body, length, codes in ((b"", 99, (b"400", b"504")), (b'{"texts": ["blue"]}', 19, (b"504",))):
+        for body, length, codes in ((b"", 99, (b"408", b"504")), (b'{"texts": ["blue"]}', 19, (b"504",))):
             with socket.create_connection(("127.0.0.1", port), 60) as line:
                 head = f"POST {RUN}/query HTTP/1.1\r\nHost: localhost:{port}\r\nContent-Length: {length}\r\n\r\n"
                 line.sendall(head.encode() + body)

@@ -39,18 +39,17 @@ def test_an_unknown_word_marks_its_row_and_the_rest_is_answered():
     assert [(one.text, "'zebra'" in one.error) for one in found] == [("red", False), ("zebra", True), ("blue", False)]
     assert (found[0].error, [*encoder.call_args_list[0].args[0]]) == ("", ["red", "zebra", "blue"])
     prompts, question = build_query(world().field, found, read, negatives=())
-    assert prompts == found
-    assert question.texts == ("red", "blue")
+    assert (prompts, question.texts) == (found, ("red", "blue"))
     np.testing.assert_array_equal(question.embeddings, np.eye(3)[:2])
     with pytest.raises(InputError, match="zebra"):
         build_query(world().field, encode_prompts("zebra", read), read)
-    with pytest.raises(InputError, match="Ask"):
+    with pytest.raises(InputError, match="prompt"):
         build_query(world().field, [], read)
 
 
 def test_what_is_wrong_with_the_line_or_the_encoder_is_an_error():
     assert len(encode_prompts(",".join(map(str, range(MAX_PROMPTS))), lambda texts: np.ones((len(texts), 3)))) == 64
-    for line, hint in ((" ;, \n", "Ask"), (",".join(map(str, range(MAX_PROMPTS + 1))), "65 .* 64")):
+    for line, hint in ((" ;, \n", "prompt"), (",".join(map(str, range(MAX_PROMPTS + 1))), "65 .* 64")):
         with pytest.raises(InputError, match=hint):
             encode_prompts(line, read)
     with pytest.raises(FileNotFoundError, match="weights are gone"):

@@ -27,6 +27,9 @@ export const $ = (id) => document.getElementById(id);
 /** @param {number} count @returns {string} */
 export const grouped = (count) => count.toLocaleString("en-US");
 
+/** @param {number} count @param {string} noun @returns {string} Text such as "1 image" or "2 images". */
+export const counted = (count, noun) => `${grouped(count)} ${noun}${count === 1 ? "" : "s"}`;
+
 /** @param {number} value @param {number} [digits] */
 export const fixed = (value, digits = 2) => (Number.isFinite(value) ? value.toFixed(digits) : "–");
 

@@ -1,5 +1,5 @@
 /** Panel with selection, objects, layers, history, cameras and advanced settings. */
-import { $, BY_HAND, cssColor, fill, fixed, grouped, h, throttled } from "./dom.js";
+import { $, BY_HAND, counted, cssColor, fill, fixed, grouped, h, throttled } from "./dom.js";
 import { icon } from "./icons.js";
 
 const COLORMAPS = ["viridis", "cividis", "inferno", "magma", "turbo"];
@@ -93,7 +93,14 @@ export class Panel {
             (anchor) => this.isolate(null, this.state.objects ?? [], anchor),
             { id: "do-isolate" },
           ),
-          button("Show all", null, "Show all hidden Gaussians.", "A", simple("show_all"), { id: "do-show" }),
+          button(
+            "Show all",
+            null,
+            "Show all hidden Gaussians, except those of hidden layers.",
+            "A",
+            simple("show_all"),
+            { id: "do-show" },
+          ),
           button("Invert", null, "Select all other visible Gaussians.", "X", simple("invert"), { id: "do-invert" }),
           button("Why?", null, "Show the images that support this selection.", "W", simple("explain"), {
             id: "do-why",
@@ -101,7 +108,7 @@ export class Panel {
           button(
             "Go to",
             null,
-            "Move the camera to the largest selected object.",
+            "Move the camera to the first object in the list.",
             "G",
             (anchor) => this.goToFirst(anchor),
             { id: "do-go" },
@@ -219,7 +226,7 @@ export class Panel {
       fold("advanced", "Advanced", "Negative prompts, rule, colormap, floaters and saved prompts.", this.advanced()),
     );
     $("facts").textContent =
-      `${grouped(run.num_gaussians)} Gaussians · ${grouped(run.num_views)} images` +
+      `${counted(run.num_gaussians, "Gaussian")} · ${counted(run.num_views, "image")}` +
       (run.num_left_out > 0 ? ` · ${grouped(run.num_left_out)} not drawn, to keep the browser responsive` : "");
     $("fold-cameras").addEventListener("toggle", () => this.showCameras(), { once: true });
   }
@@ -396,7 +403,7 @@ export class Panel {
       parts.push(visible === 0 ? "No visible objects selected" : `${grouped(visible)} visible`);
     if (hidden > 0) parts.push(`${grouped(hidden)} hidden`);
     if (some && state.by_hand) parts.push("by hand");
-    if (some) parts.unshift(`of ${grouped(state.total)} Gaussians`);
+    if (some) parts.unshift(`of ${counted(state.total, "Gaussian")}`);
     $("selected-more").textContent = parts.join(" · ") || "Search, or click an object.";
     $("warning").textContent = state.warning ?? "";
     for (const id of [
@@ -499,7 +506,7 @@ export class Panel {
       );
     });
     const note =
-      state.more_objects > 0 ? [h("li.soft.small", {}, `and ${grouped(state.more_objects)} smaller ones`)] : [];
+      state.more_objects > 0 ? [h("li.soft.small", {}, `and ${grouped(state.more_objects)} more`)] : [];
     fill(
       $("objects"),
       rows.length ? [...rows, ...note] : [h("li.soft.small", {}, "This list shows the objects of the selection.")],
@@ -528,7 +535,7 @@ export class Panel {
               onclick: () => act("layer_select", { name }),
             },
             h("span", {}, name),
-            h("span.soft.small.num", {}, `${grouped(one.count)} Gaussians`),
+            h("span.soft.small.num", {}, counted(one.count, "Gaussian")),
           ),
           button(
             visible ? `Hide ${name}` : `Show ${name}`,

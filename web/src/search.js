@@ -1,5 +1,5 @@
 /** Search box with examples and answers. */
-import { $, BY_HAND, cssColor, fill, fixed, grouped, h } from "./dom.js";
+import { $, BY_HAND, counted, cssColor, fill, fixed, h } from "./dom.js";
 import { icon } from "./icons.js";
 
 export class Search {
@@ -28,7 +28,7 @@ export class Search {
       tip: "Search. Separate several prompts by commas. Put a prompt that contains a comma in double quotes.",
       keys: "Enter",
     });
-    Object.assign($("cancel").dataset, { tip: "Stop searching.", keys: "Escape" });
+    Object.assign($("cancel").dataset, { tip: "Stop the search or the explanation.", keys: "Escape" });
     $("cancel").addEventListener("click", () => this.cancel());
     this.showExamples(true);
   }
@@ -120,7 +120,7 @@ export class Search {
     const verdict = one.verdict && one.verdict !== "found" ? one.verdict : null;
     const several = texts.length > 1;
     const tip =
-      `${grouped(one.count ?? 0)} Gaussians, best relevancy ${fixed(Math.min(1, one.relevancy ?? 0))}.` +
+      `${counted(one.count ?? 0, "Gaussian")}, best relevancy ${fixed(Math.min(1, one.relevancy ?? 0))}.` +
       (shown && !state.by_hand
         ? " Click to show all answers."
         : several || state.by_hand

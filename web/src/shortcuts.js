@@ -9,7 +9,7 @@ const POINTER = [
   ["Wheel, or pinch", "Zoom"],
   ["Click", "Select an object"],
   ["Shift + click", "Add an object"],
-  ["Ctrl or Alt + click", "Remove an object that was added"],
+  ["Ctrl or Alt + click", "Remove an object"],
   ["Arrow keys", "Turn the focused scene"],
   ["+  −", "Zoom the focused scene"],
   ["Enter", "Select the object in the middle of the focused scene"],
