@@ -262,7 +262,11 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
         nl.open_splat("x.ply", "capture")  # type: ignore[arg-type]
 
 
-def test_moves_of_another_number_of_views_are_refused(splat, frames, given, tmp_path: Path) -> None:
+def test_moves_are_applied_to_as_many_views(native, splat, frames, given, tmp_path: Path) -> None:
+    moves = 0.05 * torch.randn(len(native.train), 9, generator=generator(0), dtype=torch.float64)
+    project = write_colmap(tmp_path / "moved", _before(frames, moves, given.eval_images), "PINHOLE")
+    path = write_gsplat(tmp_path / "ckpt_0_rank0.pt", splat, pose_adjust={"embeds.weight": moves})
+    assert difference(native, nl.open_splat(path, replace(given, colmap=project))) < 1e-5
     options = replace(given, colmap=write_colmap(tmp_path / "p", frames, "PINHOLE"), eval_images=())
     for count, hint in ((12, "--test-every 8"), (5, "--test-every or --eval-images")):
         moves = {"embeds.weight": torch.zeros(count, 9)}

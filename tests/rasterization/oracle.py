@@ -1,6 +1,7 @@
 """The rasterizer once more, as loops over Python floats: written from the formulas, sharing no code."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -61,24 +62,13 @@ def compositing_matrix(scene: GaussianScene, camera: Camera, antialiased=False, 
         columns = range(math.floor((u - across) / TILE), math.ceil((u + across) / TILE))
         rows = range(math.floor((v - down) / TILE), math.ceil((v + down) / TILE))
         (a, b), (_, c) = np.linalg.inv(blurred).tolist()
-        splats.append((z, j, float(u), float(v), columns, rows, a, b, c, opacity))
-    splats.sort(key=lambda splat: splat[:2])
-    weights = np.zeros((height, width, len(scene)))
-    for row in range(height):
-        for column in range(width):
-            transmittance = 1.0
-            for _, j, u, v, columns, rows, a, b, c, opacity in splats:
-                if column // TILE not in columns or row // TILE not in rows:
-                    continue
-                dx, dy = column + 0.5 - u, row + 0.5 - v
-                alpha = min(cap, opacity * math.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)))
-                if alpha < SKIP:
-                    continue
-                if transmittance * (1 - alpha) <= STOP:
-                    break
-                weights[row, column, j] = alpha * transmittance
-                transmittance *= 1 - alpha
-    return weights
+        splats.append((z, j, columns, rows, float(u), float(v), a, b, c, opacity))
+
+    def alpha_at(x: float, y: float, u: float, v: float, a: float, b: float, c: float, opacity: float) -> float:
+        dx, dy = x - u, y - v
+        return min(cap, opacity * math.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)))
+
+    return _composited(np.zeros((height, width, len(scene))), splats, alpha_at)
 
 
 def compositing_matrix_2d(scene: GaussianScene, camera: Camera) -> np.ndarray:
@@ -100,24 +90,28 @@ def compositing_matrix_2d(scene: GaussianScene, camera: Camera) -> np.ndarray:
         if u + radius <= 0 or u - radius >= width or v + radius <= 0 or v - radius >= height:
             continue
         tiles = [range(math.floor((x - radius) / TILE), math.ceil((x + radius) / TILE)) for x in (u, v)]
-        splats.append((center[2], j, center, axes, u, v, tiles))
-    splats.sort(key=lambda splat: splat[:2])
-    weights = np.zeros((height, width, len(scene)))
-    for row in range(height):
-        for column in range(width):
-            transmittance = 1.0
-            x, y = column + 0.5, row + 0.5
-            ray = np.linalg.solve(K, [x, y, 1.0])
-            for _, j, center, axes, u, v, tiles in splats:
-                if column // TILE not in tiles[0] or row // TILE not in tiles[1]:
-                    continue
-                a, b, _ = np.linalg.solve(np.column_stack([axes, -ray]), -center)  # where the ray meets the plane
-                square = min(a**2 + b**2, 2 * ((x - u) ** 2 + (y - v) ** 2))
-                alpha = min(CAP, float(scene.opacities[j]) * math.exp(-square / 2))
-                if alpha < SKIP:
-                    continue
-                if transmittance * (1 - alpha) <= STOP:
-                    break
-                weights[row, column, j] = alpha * transmittance
-                transmittance *= 1 - alpha
+        splats.append((center[2], j, *tiles, center, axes, u, v, float(scene.opacities[j])))
+
+    def alpha_at(x: float, y: float, center: np.ndarray, axes: np.ndarray, u: float, v: float, opacity: float) -> float:
+        ray = np.linalg.solve(K, [x, y, 1.0])
+        a, b, _ = np.linalg.solve(np.column_stack([axes, -ray]), -center)  # where the ray meets the plane
+        return min(CAP, opacity * math.exp(-min(a**2 + b**2, 2 * ((x - u) ** 2 + (y - v) ** 2)) / 2))
+
+    return _composited(np.zeros((height, width, len(scene))), splats, alpha_at)
+
+
+def _composited(weights: np.ndarray, splats: list[tuple], alpha_at: Callable[..., float]) -> np.ndarray:
+    splats = sorted(splats, key=lambda splat: splat[:2])
+    for row, column in np.ndindex(weights.shape[:2]):
+        transmittance = 1.0
+        for _, j, columns, rows, *shape in splats:
+            if column // TILE not in columns or row // TILE not in rows:
+                continue
+            alpha = alpha_at(column + 0.5, row + 0.5, *shape)
+            if alpha < SKIP:
+                continue
+            if transmittance * (1 - alpha) <= STOP:
+                break
+            weights[row, column, j] = alpha * transmittance
+            transmittance *= 1 - alpha
     return weights
