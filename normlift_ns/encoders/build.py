@@ -158,6 +158,6 @@ def null_vectors(
     except InputError:  # the encoder cannot embed these words
         return None
     except FileNotFoundError as error:
-        remark = "queries of this run cannot compare with unrelated words, because the text encoder cannot be loaded"
-        warnings.warn(f"{remark}: {error}", stacklevel=2)
+        remark = "queries of this run cannot compare the scene with unrelated words"
+        warnings.warn(f"{remark}, because the text encoder cannot be loaded: {error}", stacklevel=2)
         return None

@@ -160,7 +160,7 @@ def _check_weights(options: SourceOptions) -> None:
         raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {remedy}")
     if open_clip.has_local_clip_weights(model, pretrained) is False:
         problem = f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine and cannot be downloaded"
-        with third_party_errors(problem, f"{CONNECT_ONCE}, {remedy}", FileNotFoundError):
+        with third_party_errors(problem, f"{CONNECT_ONCE}, or {remedy}", FileNotFoundError):
             check_hub_access()
 
 
@@ -248,7 +248,7 @@ def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
 
     if options.prompt_template != "{}":
         raise InputError(
-            f"--prompt-template {options.prompt_template!r} has no effect on --encoder color; remove it, or use "
+            f"--prompt-template {options.prompt_template!r} has no effect on --encoder color; remove it, or lift with "
             "--encoder open_clip"
         )
     return ColorEncoder()

@@ -88,7 +88,7 @@ def check_hub_access() -> None:
     The hub's own client would retry for most of a minute.
     """
     if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
-        raise ConnectionError("HF_HUB_OFFLINE forbids downloads")
+        raise ConnectionError("HF_HUB_OFFLINE forbids downloads; unset it")
     address = os.environ.get("HF_ENDPOINT", _HUB)
     try:
         urllib.request.urlopen(urllib.request.Request(address, method="HEAD"), timeout=_PROBE_SECONDS).close()
@@ -138,7 +138,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(read_text(path))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path.name} is damaged ({type(error).__name__})") from None
+        raise InputError(f"{path.name} cannot be read as JSON ({type(error).__name__})") from None
     if not isinstance(content, dict):
         raise InputError(f"{path.name} contains {type(content).__name__}, expected an object")
     return content
@@ -161,7 +161,7 @@ def check_not_local(name: str, parts: int, subject: str, problem: str, remedy: s
     if is_local_path(name, parts):
         raise FileNotFoundError(f"{subject} {name} does not exist; check the path, or {remedy}")
     if parts == 2 and len(Path(name).parts) != parts:
-        raise InputError(f"{subject} {name!r} is neither a path nor a hub name; {remedy}")
+        raise InputError(f"{subject} {name!r} is neither an existing path nor a hub name, OWNER/NAME; {remedy}")
 
 
 def check_packages(subject: str, minimums: Mapping[str, str], alternative: str) -> None:

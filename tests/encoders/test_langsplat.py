@@ -349,7 +349,7 @@ def test_damage_of_text_vectors_is_noticed(tmp_path):
         try:
             assert TextEmbeddingFile(file).text(["fox", "file"]).tolist() == expected
         except ValueError as error:
-            assert "texts.npz is damaged or not an NPZ file" in str(error)
+            assert "texts.npz is damaged or cannot be read as an NPZ file" in str(error)
     with zipfile.ZipFile(file, "w") as archive, zipfile.ZipFile(io.BytesIO(whole)) as original:
         for name, other in (("fox.npy", "file.npy"), ("file.npy", "fox.npy")):
             archive.writestr(name, original.read(other))
