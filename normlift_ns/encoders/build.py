@@ -65,7 +65,7 @@ _PATHS = ("regions_dir", "features_dir", "text_embeddings")
 def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, Any]:
     """Return the options of a lift as JSON-serializable values for its manifest.
 
-    The values "auto" are resolved, and paths are absolute.
+    An automatic encoder and automatic regions are resolved as in `resolve_source`, and paths are absolute.
     """
     options = resolve_source(options, device)
     settings = {**asdict(options), **absolute_paths(options)}

@@ -205,7 +205,7 @@ def _other_architecture(origin: str, config: Mapping[str, Any], family: ModelFam
     """Return the error message for a network of another family."""
     expected = " or ".join(map(repr, family.model_types))
     kind = config.get("model_type")
-    return f"{origin} has the architecture {kind!r:.60}, expected a {family.title} network ({expected})"
+    return f"{origin} has the model type {kind!r:.60}, expected a {family.title} network ({expected})"
 
 
 def _sizes(values: object, where: str) -> dict[str, Any]:

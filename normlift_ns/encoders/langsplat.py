@@ -352,7 +352,7 @@ def is_same_image(map_width: int, map_height: int, width: int, height: int) -> b
 
 
 def _sum_levels(cells: Tensor, rows: Tensor, table: Tensor) -> ViewFeatures:
-    """Return the features of a view, with the normalized sum of its table rows as the feature of each cell."""
+    """Return the features of a view. The feature of a cell is the normalized sum of its table rows."""
     zero = table.new_zeros(1, table.shape[1])  # for the row -1
     sums = torch.cat([table, zero])[rows.long()].double().sum(dim=0)
     valid = torch.linalg.vector_norm(sums, dim=1) > _MIN_SUM
