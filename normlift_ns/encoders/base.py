@@ -308,7 +308,7 @@ def iterate_view_features(
 ) -> Iterator[ViewFeatures]:
     """Yield the features of several images in order. Results may differ from `source.view` by rounding.
 
-    The iterator reads ahead in `images` if the source segments or encodes several images together.
+    The iterator reads ahead in `images` if the source processes several images at the same time.
     """
     if hasattr(source, "views") and not isinstance(source, PrecomputedFeatures):
         several: Any = source
@@ -526,7 +526,7 @@ def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: 
         ValueError: If `features` is empty, or a list whose length differs from that of `names`.
         ValueError: If labels are not an integer matrix, or contain the id of a region without a vector.
         ValueError: If vectors are not finite or not [regions, D], with the same D for all images and prompts.
-        ValueError: If the vector of a prompt is not [D], not finite or zero.
+        ValueError: If the vector of a prompt is not [D], is zero, or is not finite.
         ValueError: If a prompt is empty, ends in .npy or contains invalid characters.
     """
     if not isinstance(features, Mapping | Sequence) or isinstance(features, str):

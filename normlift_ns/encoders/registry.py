@@ -128,7 +128,7 @@ def _make_texts(
 
 
 def _check_unchanged(pretrained: str, expected: object) -> None:
-    """Raise InputError or FileNotFoundError unless the weights are those of the lift."""
+    """Raise InputError or FileNotFoundError if the weights differ from the recorded weights of the lift."""
     remedy = (
         "restore the weight file of the lift, give prompt embeddings of the same network with --text-embeddings, or "
         "lift again with: ns-normlift"

@@ -219,6 +219,8 @@ _PACKAGES = {"sam": "transformers", "edges": "h5py"}
 """Optional packages that regions need."""
 _NEXT_ENCODER = {"color": ("imagenet", "object names"), "imagenet": ("open_clip", "words outside ImageNet")}
 """Recommended encoder and its advantage, by the encoder that is selected automatically on this machine."""
+_ADVANTAGES = {"sam": "masks of objects", "edges": "regions along outlines"}
+"""Advantages of recommended regions."""
 
 
 def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
@@ -270,7 +272,7 @@ def describe_choice(options: SourceOptions, device: str) -> str | None:
         encoder = "imagenet" if "imagenet" in wanted else chosen.encoder
         preferred = _preferred_regions(replace(chosen, encoder=encoder), device)
         missing = list(takewhile(lambda name: not _is_here(name), preferred))
-        wanted |= dict.fromkeys(missing[-1:], "regions along outlines")
+        wanted |= {name: _ADVANTAGES[name] for name in missing[-1:]}
     packages = [name for regions, name in _PACKAGES.items() if regions in wanted and find_spec(name) is None]
     install = f"pip install {' '.join(packages)} && " if len(packages) > 0 else ""
     purposes = " and ".join(wanted.values())
@@ -293,7 +295,8 @@ def check_mask_options(options: SourceOptions, name: str) -> MaskSource:
         if option not in source.options and value != getattr(default, option):
             shown = " ".join(value) if isinstance(value, tuple) else value
             regions = sorted(set(MASK_SOURCES.built_in).difference(get_args(FeatureKind)))
-            takers = " or ".join(x for x in regions if option in MASK_SOURCES.load(x).options)
+            *others, last = (x for x in regions if option in MASK_SOURCES.load(x).options)
+            takers = f"{', '.join(others)} or {last}" if len(others) > 0 else last
             flag = f"--{option.replace('_', '-')}"
             raise InputError(
                 f'{flag} {shown} applies to --regions {takers}, but the regions of this lift are "{name}"; omit '
