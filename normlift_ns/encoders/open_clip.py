@@ -200,9 +200,9 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
 def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
     """Return the weight file, downloaded if necessary, and its training settings.
 
-    The settings are "mean" and "std" of the training images, and "quick_gelu", as far as open_clip's table has them. A
-    local file gets "mean" and "std" of the first published weights of the architecture. It gets no "quick_gelu", so the
-    configuration of the architecture sets the activation.
+    The settings include "mean" and "std" of the training images, and "quick_gelu", as far as open_clip's table has
+    them. A local file gets "mean" and "std" of the first published weights of the architecture. It gets no
+    "quick_gelu", so the configuration of the architecture sets the activation.
 
     Raises:
         FileNotFoundError: If the weights are not in the local cache and cannot be downloaded.

@@ -25,7 +25,7 @@ CONFIG_FILE = "config.json"
 _MAX_JSON_BYTES = 2**27
 _PROBE_SECONDS = 10
 _HUB = "https://huggingface.co"
-CONNECT_ONCE = "connect to the internet (ns-normlift-weights lists and downloads all weights)"
+CONNECT_ONCE = "connect to the internet (ns-normlift-weights lists and downloads default weights)"
 """Advice in messages about missing weights."""
 _FILE_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
 SAM_WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
@@ -49,6 +49,7 @@ def third_party_errors(problem: str, remedy: str, error_type: type[Exception] = 
         if isinstance(error, InputError) and error_type is not InputError:
             raise
         reason = str(error) if isinstance(error, InputError) else summarize_error(error)
+        reason = reason.partition(" In PyTorch 2.6")[0]  # torch continues with advice to disable its safe loading
         raise error_type(f"{problem} ({reason}); {remedy}") from None
 
 
