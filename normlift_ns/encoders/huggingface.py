@@ -172,7 +172,7 @@ class ModelFolder:
 
 
 def read_model_folder(path: Path, family: ModelFamily) -> ModelFolder:
-    """Read and check a model folder, without reading its weights and vocabulary.
+    """Read and check a model folder, except for its weights and vocabulary.
 
     Raises:
         InputError: If the folder is incomplete, damaged or of a different architecture.

@@ -107,8 +107,8 @@ def _make_encoder(options: SourceOptions, device: str) -> Encoder:
 def _make_texts(
     options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
 ) -> CachedTextEncoder:
-    """Make the text encoder of a lifted run; see `EncoderKind.texts`. To compute its digest, a local weight file is
-    read in full each time."""
+    """Make the text encoder of a lifted run; see `EncoderKind.texts`. A local weight file is read in full each time, to
+    compute its digest."""
     from normlift_ns.encoders.text_files import CachedTextEncoder, open_clip_text_identity  # noqa: PLC0415 (needs numpy)
 
     model, pretrained, template = options.encoder_model, options.encoder_pretrained, options.prompt_template

@@ -1,6 +1,6 @@
 """SAM checkpoints, which are model folders, files published by Meta, or hub names.
 
-Only the model type and sizes are read from config.json, so that it cannot refer to code, kernels or other weights.
+Entries of config.json that could refer to code, kernels or other weights are ignored.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _SAM_CONFIGS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
 _NOT_SIZES = re.compile(
     r"(?s)_|.*attn_impl|(auto_map|quantization_config|architectures|dtype|torch_dtype|transformers_version)\Z"
 )
-"""Pattern of the names of entries that are not sizes."""
+"""Pattern of the names of config entries that are ignored."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def _quiet(transformers: Any) -> Iterator[None]:
 
 
 def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
-    """Return the parts of a network's config with only their sizes; raise InputError if one is invalid."""
+    """Return the parts of a network's config that `check_config_sizes` keeps; raise InputError if one is invalid."""
     own = config if kind.config_key is None else config.get(kind.config_key)
     parts = {name: own.get(name) for name in kind.config_parts} if isinstance(own, Mapping) else {}
     for name, part in parts.items():
@@ -178,7 +178,7 @@ def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
 
 
 def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> Any:
-    """Return the entries of a config that are sizes; raise InputError if a size is implausible.
+    """Return a config without its ignored entries; raise InputError if it is too large or a number is implausible.
 
     Without this check, transformers would build a network of any size.
     """

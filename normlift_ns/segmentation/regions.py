@@ -328,7 +328,7 @@ def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
 
 
 def column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
-    """Yield slices of columns that are small enough for a temporary array of M rows."""
+    """Yield slices of columns. M rows of one slice fit into a temporary array of about `_MASK_CHUNK` elements."""
     step = min(2**24, max(1, _MASK_CHUNK[flat.device.type] // max(1, len(flat))))
     return (slice(start, start + step) for start in range(0, flat.shape[1], step))
 
