@@ -293,6 +293,6 @@ def _in_largest(runs: _Runs, grid: _Grid) -> Bool[Tensor, " n"]:
 
 
 def _spans(first: Int64[Tensor, " n"], length: Int64[Tensor, " n"]) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
-    """Return two arrays: the index i of each number in the ranges first[i]..first[i] + length[i] - 1, and the numbers."""
+    """Return the numbers of all ranges first[i]..first[i] + length[i] - 1, preceded by the array of their indices i."""
     owner = torch.repeat_interleave(length)
     return owner, torch.arange(len(owner), device=first.device) + (first - length.cumsum(0) + length)[owner]
