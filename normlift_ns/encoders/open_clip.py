@@ -168,8 +168,8 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
     """Check an architecture and its weights by name, without loading or downloading anything.
 
     Raises:
-        ValueError: If open_clip is not installed, does not have the model or the weights tag, or the installed timm
-            does not have the image encoder of the model. Also if the name of the weights is an existing folder.
+        ValueError: If open_clip is not installed, or does not have the model or the weights tag. Also if the installed
+            timm does not have the image encoder of the model, or the name of the weights is an existing folder.
         FileNotFoundError: If the name of the weights can only be a path, and the path does not exist.
     """
     config = open_clip_model_config(model)

@@ -202,7 +202,7 @@ def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> 
 _REMEDIES = {
     "SAM": f"set --sam-model to a name such as {DEFAULT_SAM}, to a folder with config.json and model.safetensors, or "
     "to a file such as sam_vit_h_4b8939.pth. To lift without SAM, use --regions patches or --regions superpixel",
-    "SAM 3": f"set --sam-model (for a lift) or --segment-model (for a query) to a name such as {DEFAULT_SAM3}, or to a "
+    "SAM 3": f"set --sam-model (lift) or --segment-model (query) to a name such as {DEFAULT_SAM3}, or to a "
     "folder with config.json, model.safetensors and a tokenizer. Without SAM 3, lift with other --regions, or query "
     "without --segment",
 }
@@ -339,9 +339,9 @@ def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[s
         return local
     title, files = _title(kinds), [WEIGHTS_FILE, *more]
     problem = f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded"
-    access = ", log in to the hub with an account that accepted the license of SAM 3" if title == "SAM 3" else ""
+    access = " and log in to the hub with an account that accepted the license of SAM 3" if title == "SAM 3" else ""
     other = re.sub(rf"a name such as {re.escape(checkpoint)}, (or )?to ", "", _REMEDIES[title])
-    with weights.third_party_errors(problem, f"{weights.CONNECT_ONCE}{access}, or {other}", FileNotFoundError):
+    with weights.third_party_errors(problem, f"{weights.CONNECT_ONCE}{access}. Otherwise, {other}", FileNotFoundError):
         return weights.download_model(checkpoint, lambda config: files if config.get("model_type") in kinds else [])
 
 
