@@ -100,7 +100,7 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
             force_preprocess_cfg={key: training[key] for key in ("mean", "std") if key in training},
         )
     with third_party_errors(
-        f"weight file {path} is damaged or does not belong to OpenCLIP model {model}",
+        f"weight file {path} cannot be loaded into OpenCLIP model {model}",
         f"give its architecture with --encoder-model, or {OPEN_CLIP_REMEDY}",
     ):
         open_clip.load_checkpoint(network, str(path), weights_only=True)

@@ -307,8 +307,7 @@ def transformers_folder(path: Path) -> Path | None:
 
 def checkpoint_errors(path: Path, title: str = "SAM") -> AbstractContextManager[None]:
     """Convert errors of other libraries to an InputError with the path of the checkpoint."""
-    problem = f"{title} checkpoint {path} is damaged or not a checkpoint of {title}"
-    return weights.third_party_errors(problem, _REMEDIES[title])
+    return weights.third_party_errors(f"{title} checkpoint {path} cannot be loaded", _REMEDIES[title])
 
 
 def _load_first_sam(path: Path) -> Any:
