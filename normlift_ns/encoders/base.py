@@ -73,7 +73,7 @@ class ViewFeatures:
             raise InputError(
                 f"each row of ViewFeatures.features must be a unit vector, but row {first} has length "
                 f"{length[first]:.3g} (rows with wrong lengths: {bad.numel()} of {len(self.features)}); normalize "
-                "them, and use the label -1 for regions without a feature"
+                "the rows, and use the label -1 for regions without a feature"
             )
 
     @property
@@ -98,7 +98,7 @@ class FeatureSource(Protocol):
     def identity(self) -> dict[str, Any]:
         """All settings that change the result, as JSON-serializable values for the manifest.
 
-        Device and precision are excluded, because they affect only rounding.
+        The device and the precision of encoders are excluded, because they affect only rounding.
         """
         ...
 
@@ -262,8 +262,8 @@ class RegionFeatures:
         chosen = self.regions.chosen or (0,) * (len(maps) == 1)
         if len(chosen) == 0 or max(chosen) >= len(maps):
             origin = ", ".join(map(str, self.regions.files(name))) or f"image {name}"
-            levels = "only level 0" if len(maps) == 1 else f"the levels 0..{len(maps) - 1}"
-            raise InputError(f"{origin} has {levels}; select a level of the regions with --level")
+            several = f"the levels 0..{len(maps) - 1}; select one of them with --level"
+            raise InputError(f"{origin} has {'only level 0; leave out --level' if len(maps) == 1 else several}")
         maps = maps if self.filled is None else _limit_regions(maps, self.filled(name, *image.shape[:2]))
         cells, regions = joint_partition(maps[:, 0])
         return image, maps, cells.cpu(), regions.cpu()
@@ -308,7 +308,7 @@ def iterate_view_features(
 ) -> Iterator[ViewFeatures]:
     """Yield the features of several images in order. Results may differ from `source.view` by rounding.
 
-    The iterator reads ahead in `images` if the source segments or encodes several images together.
+    The iterator reads ahead in `images` if the source processes several images at the same time.
     """
     if hasattr(source, "views") and not isinstance(source, PrecomputedFeatures):
         several: Any = source
@@ -320,7 +320,8 @@ def check_image(image: Tensor, name: str) -> None:
     """Raise ValueError unless `image` is a non-empty uint8 RGB image [H, W, 3]."""
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != torch.uint8 or image.numel() == 0:
         raise InputError(
-            f"image {name} must be a uint8 tensor [H, W, 3] (RGB, 0..255), got {image.dtype} {tuple(image.shape)}"
+            f"image {name} must be a non-empty uint8 tensor [H, W, 3] (RGB, 0..255), got {image.dtype} "
+            f"{tuple(image.shape)}"
         )
 
 
@@ -498,10 +499,10 @@ class PrecomputedFeatures:
         labels, vectors = self.views[name]
         if not is_downscaled(labels.shape, image.shape[:2], 1):
             if not is_downscaled(labels.shape, image.shape[:2], self.divisor):
+                downscaled = f" after lift_downscale {self.divisor}" if self.divisor > 1 else ""
                 raise InputError(
-                    f"labels of {name} have size {tuple(labels.shape)}, but the undistorted image has size "
-                    f"{tuple(image.shape[:2])} (height x width, after lift_downscale {self.divisor}); pass labels of "
-                    "the undistorted image"
+                    f"labels of {name} have size {tuple(labels.shape)} (height x width), but the undistorted image has "
+                    f"size {tuple(image.shape[:2])}{downscaled}; pass labels of the undistorted image"
                 )
             labels = torch.from_numpy(resample_nearest(labels.numpy()[None], *image.shape[:2])[0])
         vectors, labels = drop_zero_rows(vectors, labels.int())
@@ -525,7 +526,7 @@ def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: 
         ValueError: If `features` is empty, or a list whose length differs from that of `names`.
         ValueError: If labels are not an integer matrix, or contain the id of a region without a vector.
         ValueError: If vectors are not finite or not [regions, D], with the same D for all images and prompts.
-        ValueError: If the vector of a prompt is not [D], not finite or zero.
+        ValueError: If the vector of a prompt is not [D], is zero, or is not finite.
         ValueError: If a prompt is empty, ends in .npy or contains invalid characters.
     """
     if not isinstance(features, Mapping | Sequence) or isinstance(features, str):
@@ -555,7 +556,8 @@ def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: 
 def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
     """Return the labels and vectors of one image as tensors; raise InputError if they are invalid."""
     if not isinstance(pair, tuple | list) or len(pair) != 2:
-        raise InputError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}")
+        length = f" of length {len(pair)}" if isinstance(pair, tuple | list) else ""
+        raise InputError(f"features of {name} must be a pair of labels and vectors, got {type(pair).__name__}{length}")
     _check_dense(f"labels of {name}", pair[0])
     _check_dense(f"vectors of {name}", pair[1])
     try:
@@ -566,7 +568,9 @@ def _convert_view(name: str, pair: Any) -> tuple[Tensor, Tensor]:
         raise InputError(f"labels of {name} must be integers, got {labels.dtype}")
     labels, vectors = torch.from_numpy(labels.astype(np.int64)), _to_floats(pair[1])
     if vectors.ndim != 2 or vectors.shape[1] == 0 or not bool(vectors.isfinite().all()):
-        raise InputError(f"vectors of {name} must be finite and of shape [regions, D], got {_describe(vectors)}")
+        raise InputError(
+            f"vectors of {name} must be finite and of shape [regions, D] with D >= 1, got {_describe(vectors)}"
+        )
     low, high = (int(labels.min()), int(labels.max())) if labels.numel() > 0 else (0, 0)
     if labels.ndim != 2 or labels.numel() == 0 or low < -1 or high >= len(vectors):
         values = f" with values in {low}..{high}" if labels.numel() > 0 else ", which is empty"

@@ -65,7 +65,7 @@ _PATHS = ("regions_dir", "features_dir", "text_embeddings")
 def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, Any]:
     """Return the options of a lift as JSON-serializable values for its manifest.
 
-    The values "auto" are resolved, and paths are absolute.
+    An automatic encoder and automatic regions are resolved as in `resolve_source`, and paths are absolute.
     """
     options = resolve_source(options, device)
     settings = {**asdict(options), **absolute_paths(options)}
@@ -158,6 +158,6 @@ def null_vectors(
     except InputError:  # the encoder cannot embed these words
         return None
     except FileNotFoundError as error:
-        remark = "queries of this run cannot compare with unrelated words, because the text encoder cannot be loaded"
-        warnings.warn(f"{remark}: {error}", stacklevel=2)
+        remark = "queries of this run cannot compare the scene with unrelated words"
+        warnings.warn(f"{remark}, because the text encoder cannot be loaded: {error}", stacklevel=2)
         return None

@@ -42,7 +42,7 @@ class NotCachedError(InputError):
 def cached(source: FeatureSource, folder: Path, *, compute: Callable[[Any], bool] = lambda part: True) -> FeatureSource:
     """Return a source that caches its expensive results in a folder.
 
-    A source without expensive results is returned unchanged.
+    A source that is neither `RegionFeatures` nor `PatchFeatures` is returned unchanged.
 
     Args:
         compute: Function that returns True if the given regions or encoder may compute results that are not cached.
@@ -213,7 +213,7 @@ def _key_parts(tensor: Tensor) -> tuple[bytes, bytes]:
 
 
 def _read(
-    path: Path, name: str, is_valid: Callable[[Tensor], bool], compute: bool = True, image: str = "the images"
+    path: Path, name: str, is_valid: Callable[[Tensor], bool], compute: bool = True, image: str = "an image"
 ) -> Tensor | None:
     """Return a cached tensor, or None if it is missing, damaged, renamed or invalid.
 

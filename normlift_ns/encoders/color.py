@@ -54,7 +54,7 @@ _OWN_SHARE = 0.2
 closer to purple than to blue."""
 _JITTER = 1e-10
 _THREADS = min(8, os.cpu_count() or 1)
-"""Number of images that are encoded concurrently."""
+"""Number of images whose mean colors are computed concurrently."""
 _NOT_SUGGESTED = frozenset({"barf", "booger", "diarrhea", "piss", "poo", "poop", "puke", "shit", "snot", "vomit"})
 """Words of the survey that are accepted in prompts but not suggested in messages."""
 

@@ -172,16 +172,17 @@ class ModelFolder:
 
 
 def read_model_folder(path: Path, family: ModelFamily) -> ModelFolder:
-    """Read and check a model folder, without reading its weights and vocabulary.
+    """Read and check a model folder, except for its weights and vocabulary.
 
     Raises:
         InputError: If the folder is incomplete, damaged or of a different architecture.
     """
-    remedy = f"set --encoder-model to a folder of a {family.title} network or to a name such as {family.default_model}"
+    remedy = f"lift with --encoder-model set to a folder of a {family.title} network or to a name such as "
+    remedy += f"{family.default_model}, or with --encoder open_clip"
     try:
         return _read(path, family)
     except InputError as error:
-        raise InputError(f"{path}: {error}; {remedy}, or use --encoder open_clip") from None
+        raise InputError(f"{path}: {error}; {remedy}") from None
 
 
 def _read(path: Path, family: ModelFamily) -> ModelFolder:
@@ -204,7 +205,7 @@ def _other_architecture(origin: str, config: Mapping[str, Any], family: ModelFam
     """Return the error message for a network of another family."""
     expected = " or ".join(map(repr, family.model_types))
     kind = config.get("model_type")
-    return f"{origin} has the architecture {kind!r:.60}, expected a {family.title} network ({expected})"
+    return f"{origin} has the model type {kind!r:.60}, expected a {family.title} network ({expected})"
 
 
 def _sizes(values: object, where: str) -> dict[str, Any]:
@@ -348,7 +349,7 @@ def resolve_model_name(options: SourceOptions, family: ModelFamily) -> str:
 
 def check_transformers_version(family: ModelFamily) -> None:
     """Raise InputError if torch or transformers is missing or too old."""
-    weights.check_packages(f"--encoder {family.name}", _MIN_VERSIONS, "use --encoder open_clip")
+    weights.check_packages(f"--encoder {family.name}", _MIN_VERSIONS, "lift with --encoder open_clip")
 
 
 def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> None:
@@ -363,8 +364,8 @@ def check_huggingface_options(options: SourceOptions, family: ModelFamily) -> No
     check_transformers_version(family)
     if options.encoder_pretrained != DEFAULT_PRETRAINED:
         raise InputError(
-            f"--encoder-pretrained {options.encoder_pretrained} applies only to --encoder open_clip; remove it, and "
-            f"give the folder of a {family.title} network with --encoder-model"
+            f"--encoder-pretrained {options.encoder_pretrained} applies only to --encoder open_clip; remove it. To "
+            f"choose a {family.title} network, give its folder or hub name with --encoder-model"
         )
     model = resolve_model_name(options, family)
     check_model_name(model, family)
@@ -420,7 +421,7 @@ def fetch_model(model: str, family: ModelFamily) -> Path:
 def _download_errors(model: str, family: ModelFamily) -> AbstractContextManager[None]:
     return weights.third_party_errors(
         f"the {family.title} network {model} is not on this machine and cannot be downloaded",
-        f"{weights.CONNECT_ONCE}, or give a folder with --encoder-model. Alternatives are --encoder imagenet (weights "
-        "from the Python package index) and --encoder color (no weights)",
+        f"{weights.CONNECT_ONCE}, or lift with --encoder-model FOLDER, --encoder imagenet (weights from the Python "
+        "package index) or --encoder color (no weights)",
         FileNotFoundError,
     )

@@ -175,9 +175,10 @@ def load_huggingface_network(
             network.
     """
     remedy = (
-        f"set --encoder-model to another folder or to a name such as {family.default_model}, or use --encoder open_clip"
+        f"lift with --encoder-model set to another folder or to a name such as {family.default_model}, or with "
+        "--encoder open_clip"
     )
-    with third_party_errors(f"{folder.path} is damaged or not a {family.title} network", remedy):
+    with third_party_errors(f"{folder.path} cannot be loaded as a {family.title} network", remedy):
         model = _build_model(folder)
         tokenizer = _load_tokenizer(folder, model.config.text_config)
     half = torch.device(device).type == "cuda"

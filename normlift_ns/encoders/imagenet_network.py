@@ -57,7 +57,7 @@ def _norm(channels: int) -> nn.BatchNorm2d:
 
 
 class _Block(nn.Module):
-    """An inverted residual block with an expansion, a depthwise convolution and a projection."""
+    """An inverted residual block with an optional expansion, a depthwise convolution and a projection."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
         super().__init__()

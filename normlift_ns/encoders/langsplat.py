@@ -5,8 +5,8 @@ consecutive lists of masks: all SAM masks, subparts, parts and wholes. The segme
 the table row of each pixel in each list, or -1 for none. The reader also accepts:
 
 * segment maps of any float or integer type, with one channel or four;
-* ids past the end of the table, NaN or negative ids, and table rows that are zero or not finite. These pixels are
-  unlabeled, and the reader warns about them, except for negative ids.
+* ids that are negative, not finite or past the end of the table, and table rows that are zero or not finite. Pixels
+  with such ids or rows are unlabeled. The reader warns about them, except for negative ids.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def open_segment_map(path: Path) -> np.ndarray:
     shape_fits = segments.ndim == 3 and len(segments) in (1, len(LANGSPLAT_LEVELS)) and segments.size > 0
     if segments.dtype.kind not in "fiu" or not shape_fits:
         raise InputError(
-            f"segment map {path} is {segments.dtype} {segments.shape}, expected numbers [4, H, W], [1, H, W] or "
-            "[H, W]; preprocess the image again"
+            f"segment map {path} is {segments.dtype} {segments.shape}, expected a non-empty array of numbers, "
+            "[4, H, W], [1, H, W] or [H, W]; preprocess the image again"
         )
     return segments
 
@@ -86,7 +86,8 @@ def read_segment_map(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
         channel, y, x = fractional[0].tolist()
         raise InputError(
             f"segment map {path}: channel {channel}, row {y}, column {x} has the value {values[channel, y, x]:g}, "
-            "which is not an integer, so the map was interpolated; make it again with nearest-neighbor interpolation"
+            "which is not an integer, so the map was probably interpolated; make it again with nearest-neighbor "
+            "interpolation"
         )
     if segments.dtype.kind == "f" and segments.dtype.itemsize == 2 and bool((values >= _MAX_EXACT_HALF).any()):
         raise InputError(
@@ -100,7 +101,7 @@ def read_segment_map(path: Path, rows: int) -> Int32[np.ndarray, "c h w"]:
             ids = shorten_list([f"{value:g}" for value in np.unique(segments[invalid])])
             warnings.warn(
                 f"segment map {path} has ids {problem} (ids: {ids}; channels: {channels}; pixels: "
-                f"{int(invalid.sum())}); such pixels are treated as unlabeled",
+                f"{int(invalid.sum())}); these pixels are treated as unlabeled",
                 stacklevel=2,
             )
     return np.where(past | (values < 0), -1, values).astype(np.int32)
@@ -179,6 +180,7 @@ _CROP_TOLERANCE = 0.02
 
 Undistortion causes such crops. Larger differences indicate another resolution.
 """
+_RENAME = "by renaming the images so that their file names differ before the first dot"
 _MIN_SUM = 1e-6
 """Length below which a sum of unit vectors has no direction."""
 
@@ -254,7 +256,7 @@ class LangSplat:
                 )
             warnings.warn(f"{problem}; the lift skips these images", stacklevel=2)
         maps = ((name, files.segments) for name, files in files_of.items())
-        check_files_distinct(maps, "features", "by naming the images so that they differ before the first dot")
+        check_files_distinct(maps, "segment map", _RENAME)
         dimensions: dict[int, Path] = {}
         for files in files_of.values():
             dimensions.setdefault(open_feature_table(files.features).shape[1], files.features)
@@ -351,7 +353,7 @@ def is_same_image(map_width: int, map_height: int, width: int, height: int) -> b
 
 
 def _sum_levels(cells: Tensor, rows: Tensor, table: Tensor) -> ViewFeatures:
-    """Return the features of a view, with the normalized sum of its table rows as the feature of each cell."""
+    """Return the features of a view. The feature of a cell is the normalized sum of its table rows."""
     zero = table.new_zeros(1, table.shape[1])  # for the row -1
     sums = torch.cat([table, zero])[rows.long()].double().sum(dim=0)
     valid = torch.linalg.vector_norm(sums, dim=1) > _MIN_SUM
@@ -366,8 +368,7 @@ def check_unique_stems(names: Sequence[str]) -> None:
         ValueError: If the files of two images would have the same name.
     """
     files = ((name, Path(f"{_stem(name)}_s.npy")) for name in names)
-    remedy = "by renaming the images so that they differ before the first dot, or lift without the export"
-    check_files_distinct(files, "exported file", remedy)
+    check_files_distinct(files, "exported file", f"{_RENAME}, or lift without the export")
 
 
 def _stem(name: str) -> str:

@@ -82,15 +82,15 @@ def _folder() -> Path:
     spec = find_spec("open_clip")
     if spec is None or spec.origin is None:
         raise InputError(
-            "open_clip is not installed; install it with pip install open_clip_torch, or use --encoder color, which "
-            "does not need it"
+            "open_clip is not installed; install it with pip install open_clip_torch, or lift with --encoder color, "
+            "which does not need it"
         )
     return Path(spec.origin).parent
 
 
 OPEN_CLIP_REMEDY = (
-    "give a local weight file (.safetensors, .bin or .pt) with --encoder-pretrained FILE, or use --encoder imagenet "
-    "(weights from the Python package index) or --encoder color (no weights)"
+    "lift with --encoder-pretrained FILE (a local .safetensors, .bin or .pt file), --encoder imagenet (weights from "
+    "the Python package index) or --encoder color (no weights)"
 )
 
 
@@ -168,8 +168,8 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
     """Check an architecture and its weights by name, without loading or downloading anything.
 
     Raises:
-        ValueError: If open_clip is not installed, does not have the model or the weights tag, or the installed timm
-            does not have the image encoder of the model. Also if the name of the weights is an existing folder.
+        ValueError: If open_clip is not installed, or does not have the model or the weights tag. Also if the installed
+            timm does not have the image encoder of the model, or the name of the weights is an existing folder.
         FileNotFoundError: If the name of the weights can only be a path, and the path does not exist.
     """
     config = open_clip_model_config(model)
@@ -193,16 +193,16 @@ def check_open_clip_names(model: str, pretrained: str) -> None:
         return
     check_not_local(pretrained, 1, "--encoder-pretrained", "not a weight file of an OpenCLIP model", OPEN_CLIP_REMEDY)
     known = ", ".join(tags.list_pretrained_tags_by_model(model))
-    advice = f"use one of its tags ({known}), " if known else ""
+    advice = f"use one of its tags ({known}), or " if known else ""
     raise InputError(f"unknown weights {pretrained!r} of OpenCLIP model {model}; {advice}{OPEN_CLIP_REMEDY}")
 
 
 def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str, Any]]:
     """Return the weight file, downloaded if necessary, and its training settings.
 
-    The settings are "mean" and "std" of the training images, and "quick_gelu", as far as open_clip's table has them. A
-    local file gets "mean" and "std" of the first published weights of the architecture. It gets no "quick_gelu", so the
-    configuration of the architecture sets the activation.
+    The settings include "mean" and "std" of the training images, and "quick_gelu", as far as open_clip's table has
+    them. A local file gets "mean" and "std" of the first published weights of the architecture. It gets no
+    "quick_gelu", so the configuration of the architecture sets the activation.
 
     Raises:
         FileNotFoundError: If the weights are not in the local cache and cannot be downloaded.
@@ -212,7 +212,7 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
         return path, published
     origin = published.get("hf_hub", "").rstrip("/") or published.get("url", "")
     problem = f"weights {pretrained!r} of OpenCLIP model {model} ({origin}) are not in the local cache"
-    remedy = f"{CONNECT_ONCE}, {OPEN_CLIP_REMEDY}"
+    remedy = f"{CONNECT_ONCE}, or {OPEN_CLIP_REMEDY}"
     with third_party_errors(f"{problem} and cannot be downloaded", remedy, FileNotFoundError):
         if published.get("hf_hub"):
             check_hub_access()

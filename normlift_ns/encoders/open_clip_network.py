@@ -89,7 +89,7 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
         _Uninitialized(),
         third_party_errors(
             f"OpenCLIP model {model} cannot be built with the packages installed here",
-            f"choose another model with --encoder-model, such as {DEFAULT_MODEL}",
+            f"lift with another --encoder-model, such as {DEFAULT_MODEL}",
         ),
     ):
         network = open_clip.create_model(
@@ -100,14 +100,14 @@ def load_open_clip(model: str, pretrained: str, device: str) -> OpenClipNetwork:
             force_preprocess_cfg={key: training[key] for key in ("mean", "std") if key in training},
         )
     with third_party_errors(
-        f"weight file {path} is damaged or does not belong to OpenCLIP model {model}",
-        f"give its architecture with --encoder-model, {OPEN_CLIP_REMEDY}",
+        f"weight file {path} cannot be loaded into OpenCLIP model {model}",
+        f"give its architecture with --encoder-model, or {OPEN_CLIP_REMEDY}",
     ):
         open_clip.load_checkpoint(network, str(path), weights_only=True)
     with third_party_errors(
         f"the tokenizer of OpenCLIP model {model} cannot be loaded",
-        f"{CONNECT_ONCE}, use a model with OpenCLIP's own tokenizer, such as "
-        f"{DEFAULT_MODEL}, or use --encoder color, which needs no tokenizer",
+        f"{CONNECT_ONCE}, or lift with a model that has OpenCLIP's own tokenizer, such as {DEFAULT_MODEL}, or with "
+        "--encoder color, which needs no tokenizer",
         FileNotFoundError,
     ):
         tokenizer = open_clip.get_tokenizer(model)

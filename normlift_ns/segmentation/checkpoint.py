@@ -1,6 +1,6 @@
 """SAM checkpoints, which are model folders, files published by Meta, or hub names.
 
-Only network sizes are read from config.json, so that it cannot refer to code, kernels or other weights.
+Entries of config.json that could refer to code, kernels or other weights are ignored.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ _MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
 """Upper bounds on numbers of layers, labels and entries, on all other numbers of a config, and on its nesting depth."""
 _MIN_TORCH = "2.6"
 _ALTERNATIVE = "lift with the original SAM: --regions sam --sam-model sam_vit_h_4b8939.pth (a file published by Meta)"
+_SAM3_ALTERNATIVE = "lift with other --regions, or query without --segment"
 _SAM_CONFIGS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
 _NOT_SIZES = re.compile(
     r"(?s)_|.*attn_impl|(auto_map|quantization_config|architectures|dtype|torch_dtype|transformers_version)\Z"
 )
-"""Pattern of the names of entries that are not sizes."""
+"""Pattern of the names of config entries that are ignored."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,8 @@ def read_sam_family(folder: Path, kinds: Mapping[str, SamFamily]) -> SamFamily:
 def check_versions(kind: SamFamily) -> None:
     """Raise InputError if the installed torch or transformers is too old for a network other than the original SAM."""
     if kind is not SAM:
-        weights.check_packages(kind.name, {"torch": _MIN_TORCH, "transformers": kind.min_transformers}, _ALTERNATIVE)
+        alternative = _SAM3_ALTERNATIVE if kind.name == "SAM 3" else _ALTERNATIVE
+        weights.check_packages(kind.name, {"torch": _MIN_TORCH, "transformers": kind.min_transformers}, alternative)
 
 
 def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
@@ -137,7 +139,7 @@ def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
     missing = sorted(map(str, [*report["missing_keys"], *report["mismatched_keys"]]))
     if len(missing) > 0:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise InputError(f"in {WEIGHTS_FILE}, parameters are missing or have other shapes: {missing[0]}{more}")
+        raise InputError(f"in {WEIGHTS_FILE}, parameters are missing or have wrong shapes: {missing[0]}{more}")
     return model.eval().requires_grad_(False)
 
 
@@ -157,12 +159,13 @@ def _quiet(transformers: Any) -> Iterator[None]:
 
 
 def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
-    """Return the parts of a network's config with only their sizes; raise InputError if one is invalid."""
+    """Return the parts of a network's config that `check_config_sizes` keeps; raise InputError if one is invalid."""
     own = config if kind.config_key is None else config.get(kind.config_key)
     parts = {name: own.get(name) for name in kind.config_parts} if isinstance(own, Mapping) else {}
     for name, part in parts.items():
         if not isinstance(part, Mapping):
-            raise InputError(f"{name} of config.json is {type(part).__name__}, expected an object")
+            found = "missing" if part is None else type(part).__name__
+            raise InputError(f"{name} of config.json is {found}, expected an object")
     sizes = check_config_sizes(parts)
     for path, expected in kind.nested_types:
         part: Any = sizes
@@ -175,7 +178,7 @@ def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
 
 
 def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> Any:
-    """Return the entries of a config that are sizes; raise InputError if a size is implausible.
+    """Return a config without its ignored entries; raise InputError if it is too large or a number is implausible.
 
     Without this check, transformers would build a network of any size.
     """
@@ -197,11 +200,11 @@ def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> 
 
 
 _REMEDIES = {
-    "SAM": f"set --sam-model to a name such as {DEFAULT_SAM}, a folder with config.json and model.safetensors, or a "
-    "file such as sam_vit_h_4b8939.pth. To segment without SAM, use --regions patches or --regions superpixel",
-    "SAM 3": f"set --sam-model (for a lift) or --segment-model (for a query) to a name such as {DEFAULT_SAM3}, or to a "
-    "folder with config.json, model.safetensors and a tokenizer. To work without SAM 3, use other --regions and remove "
-    "--segment",
+    "SAM": f"set --sam-model to a name such as {DEFAULT_SAM}, to a folder with config.json and model.safetensors, or "
+    "to a file such as sam_vit_h_4b8939.pth. To lift without SAM, use --regions patches or --regions superpixel",
+    "SAM 3": f"set --sam-model (lift) or --segment-model (query) to a name such as {DEFAULT_SAM3}, or to a "
+    "folder with config.json, model.safetensors and a tokenizer. Without SAM 3, lift with other --regions, or query "
+    "without --segment",
 }
 """Advice in messages about an unusable checkpoint, by the name of the network."""
 _FIRST = "the original SAM (ViT-B, ViT-L or ViT-H)"
@@ -304,8 +307,7 @@ def transformers_folder(path: Path) -> Path | None:
 
 def checkpoint_errors(path: Path, title: str = "SAM") -> AbstractContextManager[None]:
     """Convert errors of other libraries to an InputError with the path of the checkpoint."""
-    problem = f"{title} checkpoint {path} is damaged or not a checkpoint of {title}"
-    return weights.third_party_errors(problem, _REMEDIES[title])
+    return weights.third_party_errors(f"{title} checkpoint {path} cannot be loaded", _REMEDIES[title])
 
 
 def _load_first_sam(path: Path) -> Any:
@@ -336,13 +338,15 @@ def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[s
         return local
     title, files = _title(kinds), [WEIGHTS_FILE, *more]
     problem = f"{title} checkpoint {checkpoint} is not in the local cache and cannot be downloaded"
-    with weights.third_party_errors(problem, f"{weights.CONNECT_ONCE}, or {_REMEDIES[title]}", FileNotFoundError):
+    access = " and log in to the hub with an account that accepted the license of SAM 3" if title == "SAM 3" else ""
+    other = re.sub(rf"a name such as {re.escape(checkpoint)}, (or )?to ", "", _REMEDIES[title])
+    with weights.third_party_errors(problem, f"{weights.CONNECT_ONCE}{access}. Otherwise, {other}", FileNotFoundError):
         return weights.download_model(checkpoint, lambda config: files if config.get("model_type") in kinds else [])
 
 
 def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
     if read_sam_family(folder, POINT_PROMPT_FAMILIES) is not SAM:
-        raise InputError(f"the folder does not contain {_FIRST}")
+        raise InputError(f"config.json in its folder does not describe {_FIRST}{_AS_FOLDER}")
     files = _weight_files(folder)
     if len(files) == 0:
         raise InputError(f"the folder has no {WEIGHTS_FILE}")

@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 from normlift_ns.segmentation.regions import column_chunks
 
 _MIN_KEPT = 3
-"""Number of the best masks that are kept if no score is high enough."""
+"""Number of the best masks that pass the threshold of scores if no score is high enough."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Suppression:
     iou: float = 0.8
     """Drop a mask if its IoU with a mask of higher score is above this threshold."""
     score: float = 0.7
-    """Drop a mask if its score is not above this threshold. If this would drop all masks, the best three are kept."""
+    """Drop a mask if its score is not above this threshold. If no score is above it, the best three masks pass."""
     outer: float = 0.5
     """Drop a mask inside a larger one only if it covers less than this fraction of the larger mask."""
     inner: float = 0.85
@@ -293,6 +293,6 @@ def _in_largest(runs: _Runs, grid: _Grid) -> Bool[Tensor, " n"]:
 
 
 def _spans(first: Int64[Tensor, " n"], length: Int64[Tensor, " n"]) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
-    """Return the index i and the value of every number from first[i] to first[i] + length[i] - 1, for all i in turn."""
+    """Return the numbers of all ranges first[i]..first[i] + length[i] - 1, preceded by the array of their indices i."""
     owner = torch.repeat_interleave(length)
     return owner, torch.arange(len(owner), device=first.device) + (first - length.cumsum(0) + length)[owner]

@@ -63,8 +63,7 @@ def _open_image(path: Path, what: str, formats: tuple[str, ...]) -> Iterator[Ima
         OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, OverflowError, struct.error, zlib.error,
     ) as error:  # fmt: skip
         raise InputError(
-            f"{what} {path} is damaged or not an image ({error}); replace it with a file that Pillow can decode, such "
-            f"as {formats[0]}"
+            f"{what} {path} cannot be read as an image ({error}); replace it with a valid {formats[0]} file"
         ) from error
 
 
@@ -85,7 +84,7 @@ _MAP_SUFFIXES, _MAP_FORMATS = (".png", ".npy"), ("PNG",)
 _MAX_MAP_BYTES = 2**31
 """Largest size of a label map file, in bytes."""
 WORKERS = min(8, os.cpu_count() or 1)
-"""Number of images to segment concurrently. Superpixels need many times the memory of their image."""
+"""Number of images to segment concurrently, at most 8 because superpixels need many times the memory of their image."""
 
 
 class RegionDefaults:
@@ -139,7 +138,7 @@ class Grid(RegionDefaults):
 
 @dataclass(frozen=True)
 class LabelFiles(RegionDefaults):
-    """Label maps from a folder, one per image, each of the size of its image.
+    """Label maps from a folder, one per image.
 
     A PNG file is grayscale with 1, 8 or 16 bits, or indexed, with palette indices as labels. An NPY file has any
     integer type, and can contain several levels, [levels, H, W]. The map of "images/left/0001.jpg" is the first of
@@ -174,8 +173,8 @@ class LabelFiles(RegionDefaults):
         if not os.path.isdir(self.folder):
             problem = "is not a folder" if os.path.lexists(self.folder) else "does not exist"
             raise FileNotFoundError(
-                f"the folder of {self.description}s {self.folder} {problem} ({self.flag}); give a folder with one "
-                "PNG or NPY file per image"
+                f"{self.flag} {self.folder} {problem}; give a folder of {self.description}s, with one PNG or NPY file "
+                "per image"
             )
 
     @property
@@ -253,7 +252,7 @@ class LabelFiles(RegionDefaults):
 
         Raises:
             FileNotFoundError, ValueError: For the same reasons as `path`.
-            ValueError: If the file cannot be read, has color channels, or has values that are not integers.
+            ValueError: If the file cannot be read, has several channels, or has values that are not integers.
             ValueError: If a PNG file is grayscale with 2 or 4 bits, which readers scale.
         """
         path = self.path(name)
@@ -272,13 +271,13 @@ class LabelFiles(RegionDefaults):
                 )
         if maps.ndim == 3 and path.suffix == ".png":
             raise InputError(
-                f"{what} has {maps.shape[2]} color channels, expected one value per pixel; save "
+                f"{what} has {maps.shape[2]} channels, expected one value per pixel; save "
                 "it as an 8-bit or 16-bit grayscale PNG, as an indexed PNG, or as NPY"
             )
         if maps.dtype.kind not in "iub":
             raise InputError(f"{what} has type {maps.dtype}, expected integers; save it with .astype(numpy.int32)")
         if maps.ndim not in (2, 3) or maps.size == 0:
-            raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W]")
+            raise InputError(f"{what} has shape {maps.shape}, expected [H, W] or [levels, H, W] without empty axes")
         maps = maps.astype(np.uint8) if maps.dtype == bool else maps
         maps = maps.reshape(-1, *maps.shape[-2:])
         return maps if self.undistort is None else self.undistort(name, maps)
@@ -329,7 +328,7 @@ def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
 
 
 def column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
-    """Yield slices of columns that are small enough for a temporary array of M rows."""
+    """Yield slices of columns. M rows of one slice fit into a temporary array of about `_MASK_CHUNK` elements."""
     step = min(2**24, max(1, _MASK_CHUNK[flat.device.type] // max(1, len(flat))))
     return (slice(start, start + step) for start in range(0, flat.shape[1], step))
 
@@ -471,8 +470,8 @@ def _join_fragments(labels: Int32[np.ndarray, "h w"], smallest: float) -> Int32[
     Args:
         labels: Any labels. Two pieces with the same label become two regions.
         smallest: Number of pixels below which a piece is small. A small piece joins the region of a neighbor that is
-            not small or has already joined a region. Of several such neighbors, it is the one with the longest shared
-            boundary.
+            not small or has already joined a region. If several neighbors qualify, it joins the one with which it
+            shares the longest boundary.
     """
     pieces, count = _connected_pieces(labels)
     size = np.bincount(pieces.ravel())

@@ -65,7 +65,7 @@ def _make(path: str, arguments: Callable[[SourceOptions, str], tuple[Any, ...]])
     """Return a function that imports a class, which needs torch, and creates an instance of it.
 
     Args:
-        path: Module of the package and class, such as "segmentation.sam:SamMasks".
+        path: Module in this package and name of the class, such as "segmentation.sam:SamMasks".
         arguments: Function that returns the arguments of the class for options and a device.
     """
     module, _, name = path.partition(":")
@@ -120,8 +120,8 @@ def _make_patches(options: SourceOptions, device: str) -> FeatureSource:
     encoder: Any = make_encoder(options, device)
     if not hasattr(encoder, "patches"):
         raise InputError(
-            f"--regions patches needs an encoder of patches, but --encoder {with_encoder(options).encoder} cannot "
-            "encode them. Use --regions superpixel or --encoder open_clip"
+            f"--regions patches needs an encoder that can embed patches, but --encoder {with_encoder(options).encoder} "
+            "cannot. Use --regions superpixel or --encoder open_clip"
         )
     return PatchFeatures(encoder, options.region_count or _PATCH_COUNT)
 
@@ -170,9 +170,10 @@ def _check_langsplat(options: SourceOptions) -> None:
         raise InputError("--features langsplat needs the folder of the features; add --features-dir FOLDER")
     _check_level(options, "langsplat", (*_LEVELS, "sum"))
     if options.regions != "auto" or options.regions_dir is not None:
+        flag = "--regions" if options.regions != "auto" else "--regions-dir"
         raise InputError(
-            "--regions and --regions-dir cannot be combined with --features, which imports its own regions; leave one "
-            "of them out"
+            f"{flag} cannot be combined with --features langsplat, which imports its own regions; leave out one of the "
+            "two options"
         )
     if not encoder_kind(with_encoder(options).encoder).learned and options.text_embeddings is None:
         raise InputError(
@@ -218,6 +219,8 @@ _PACKAGES = {"sam": "transformers", "edges": "h5py"}
 """Optional packages that regions need."""
 _NEXT_ENCODER = {"color": ("imagenet", "object names"), "imagenet": ("open_clip", "words outside ImageNet")}
 """Recommended encoder and its advantage, by the encoder that is selected automatically on this machine."""
+_ADVANTAGES = {"sam": "masks of objects", "edges": "regions along outlines"}
+"""Advantages of recommended regions."""
 
 
 def resolve_regions(options: SourceOptions, device: str = "cpu") -> str:
@@ -255,7 +258,7 @@ def resolve_source(options: SourceOptions, device: str = "cpu") -> SourceOptions
 
 
 def describe_choice(options: SourceOptions, device: str) -> str | None:
-    """Return one line with the automatic encoder and regions, and the command that downloads preferred weights.
+    """Return one line with the automatic encoder and regions, and a command for better weights, if there are any.
 
     Return None if features are imported, or if neither the encoder nor the regions of a learned encoder are automatic.
     """
@@ -269,7 +272,7 @@ def describe_choice(options: SourceOptions, device: str) -> str | None:
         encoder = "imagenet" if "imagenet" in wanted else chosen.encoder
         preferred = _preferred_regions(replace(chosen, encoder=encoder), device)
         missing = list(takewhile(lambda name: not _is_here(name), preferred))
-        wanted |= dict.fromkeys(missing[-1:], "regions along outlines")
+        wanted |= {name: _ADVANTAGES[name] for name in missing[-1:]}
     packages = [name for regions, name in _PACKAGES.items() if regions in wanted and find_spec(name) is None]
     install = f"pip install {' '.join(packages)} && " if len(packages) > 0 else ""
     purposes = " and ".join(wanted.values())
@@ -292,10 +295,11 @@ def check_mask_options(options: SourceOptions, name: str) -> MaskSource:
         if option not in source.options and value != getattr(default, option):
             shown = " ".join(value) if isinstance(value, tuple) else value
             regions = sorted(set(MASK_SOURCES.built_in).difference(get_args(FeatureKind)))
-            takers = ", ".join(x for x in regions if option in MASK_SOURCES.load(x).options)
+            *others, last = (x for x in regions if option in MASK_SOURCES.load(x).options)
+            takers = f"{', '.join(others)} or {last}" if len(others) > 0 else last
             flag = f"--{option.replace('_', '-')}"
             raise InputError(
-                f'{flag} {shown} works only with --regions {takers}, but the regions of this lift are "{name}"; omit '
+                f'{flag} {shown} applies to --regions {takers}, but the regions of this lift are "{name}"; omit '
                 f"{flag}, or choose other regions with --regions"
             )
     source.check(options)

@@ -362,8 +362,8 @@ class PromptedNetwork(ABC):
 class SamNetwork(PromptedNetwork):
     """The original SAM network.
 
-    Matrix products use the precision of the network. Sums, normalizations and the prompt tokens of the mask decoder
-    always use float32.
+    In half precision, the image encoder uses autocast. In the mask decoder, image positions have the precision of the
+    network, and tokens stay in float32.
     """
 
     def __init__(self, model: Any, device: str, precision: SamPrecision = "auto") -> None:

@@ -94,7 +94,7 @@ def test_bad_options_say_what_to_do(tmp_path):
         ({"regions": "grid", "sam_model": "x/y"}, ["--sam-model x/y", "--regions sam", '"grid"']),
         ({"regions": "grid", "sam_precision": "float16"}, ["--sam-precision float16", "--regions sam", '"grid"']),
         ({"regions": "files"}, ["--regions files", "--regions-dir"]),
-        ({"regions": "grid", "level": "1"}, ["--level 1", "--regions edges, files, sam", '"grid"']),
+        ({"regions": "grid", "level": "1"}, ["--level 1", "--regions edges, files or sam", '"grid"']),
         ({"level": "l", "regions_dir": Path()}, ["--level", "--regions files", "'l'"]),
         ({"level": "-1", "regions_dir": Path()}, ["--level", "'-1'"]),
         ({"features": "langsplat"}, ["--features langsplat", "--features-dir"]),

@@ -90,8 +90,8 @@ def test_bombs_programs_and_lossy_pictures_are_refused_by_name(tmp_path: Path) -
         path.write_bytes(grey_png(side, side, 8, bytes(2**20)))
         refused(lambda: LabelFiles(tmp_path, resample=True).labels(IMAGE, NAME), str(path), "too large")
     path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 6\n%%EndComments\nshowpage\n")
-    refused(lambda: read_image(path), str(path), "damaged or not an image")
-    refused(lambda: LabelFiles(tmp_path).labels(IMAGE, NAME), "label map", str(path), "damaged or not an image")
+    refused(lambda: read_image(path), str(path), "cannot be read as an image")
+    refused(lambda: LabelFiles(tmp_path).labels(IMAGE, NAME), "label map", str(path), "cannot be read as an image")
     Image.fromarray(MAP.astype(np.uint8)).save(path, "jpeg")
     refused(lambda: LabelFiles(tmp_path).labels(IMAGE, NAME), "label map", str(path), "PNG")
 

@@ -275,8 +275,8 @@ def test_flags_make_the_source(folder):
     found = make_source(SourceOptions(**options, text_embeddings=folder / "texts.npz"))
     assert torch.allclose(found.text(["cup"]), torch.full((1, D), D**-0.5))
     for given, parts in (
-        ({**options, "regions": "grid"}, ["--regions", "--regions-dir", "--features"]),
-        ({**options, "regions_dir": folder}, ["leave one of them out"]),
+        ({**options, "regions": "grid"}, ["--regions cannot", "--features langsplat"]),
+        ({**options, "regions_dir": folder}, ["--regions-dir cannot"]),
         ({**options, "encoder": "color"}, ["--encoder color", "--encoder-model"]),
         ({"encoder": "color", "text_embeddings": folder / "texts.npz"}, ["--text-embeddings", "--features langsplat"]),
     ):
@@ -349,7 +349,7 @@ def test_damage_of_text_vectors_is_noticed(tmp_path):
         try:
             assert TextEmbeddingFile(file).text(["fox", "file"]).tolist() == expected
         except ValueError as error:
-            assert "texts.npz is damaged or not an NPZ file" in str(error)
+            assert "texts.npz is damaged or cannot be read as an NPZ file" in str(error)
     with zipfile.ZipFile(file, "w") as archive, zipfile.ZipFile(io.BytesIO(whole)) as original:
         for name, other in (("fox.npy", "file.npy"), ("file.npy", "fox.npy")):
             archive.writestr(name, original.read(other))

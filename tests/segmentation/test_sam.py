@@ -160,12 +160,11 @@ def test_identity_holds_the_content_and_the_rules_but_no_level(sam_weights, tmp_
 
 
 def test_what_is_no_checkpoint(sam_weights, empty_hub, tmp_path, monkeypatch):
-    missing = FileNotFoundError
-    refused(lambda: SamMasks("/nowhere/sam_vit_h.pth"), "/nowhere/sam_vit_h.pth", "--regions", error=missing)
-    refused(lambda: SamMasks("sam_vit_h.pth"), "sam_vit_h.pth does not exist", error=missing)
+    refused(lambda: SamMasks("/nowhere/sam_vit_h.pth"), "/nowhere/sam_vit_h.pth", "--regions", error=FileNotFoundError)
+    refused(lambda: SamMasks("sam_vit_h.pth"), "sam_vit_h.pth does not exist", error=FileNotFoundError)
     refused(lambda: SamMasks("vit_h"), "'vit_h'", "facebook/sam-vit-huge")
     parts = ("facebook/sam-vit-huge", "Name or service not known", "--sam-model", "--regions patches")
-    refused(lambda: SamMasks().masks(noise(30, 40)), *parts, error=missing)
+    refused(lambda: SamMasks().masks(noise(30, 40)), *parts, error=FileNotFoundError)
     monkeypatch.setitem(sys.modules, "transformers", None)
     refused(SamMasks, "transformers", 'pip install "normlift-ns[sam]"', "patches")
 
