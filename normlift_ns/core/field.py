@@ -72,8 +72,7 @@ class SemanticField(TensorRecord):
     means: Float[Tensor, "n 3"] | None = None
     """Centers of the Gaussians at the time of the lift, float32; None in fields of version 0.1."""
     null_level: Float[Tensor, " n"] | None = None
-    """Null level of every Gaussian's own direction (see `with_null_level`), or None if the encoder has no null
-    vocabulary."""
+    """Null level of every Gaussian's own direction (see `with_null_level`), or None without a null vocabulary."""
 
     def __len__(self) -> int:
         return self.source.numel()

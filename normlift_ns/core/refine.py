@@ -20,7 +20,7 @@ from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
 from normlift_ns.core.partition import PARTITION_BLOCK, spatial_order
 from normlift_ns.core.sparse import SparseRows, sum_equal_keys
 from normlift_ns.errors import InputError
-from normlift_ns.options import RefineConfig
+from normlift_ns.options import RefineConfig, option_name
 
 _CHUNK_ELEMENTS = (2**22, 2**24)
 """Number of elements of the largest tensor of a vote in torch, on CPU and GPU. The CPU limit suits its caches."""
@@ -126,7 +126,7 @@ def _check_inputs(
     if posterior and own is not None:
         check_not_negative("own", own)
     if isinstance(directions, Tensor):
-        advice = "normalize them, or set those without a direction to 0"
+        advice = "give rows of length 1, or of zeros for Gaussians without a direction"
         check_unit_rows(directions, "rows of directions", advice, allow_zeros=True)
 
 
@@ -222,7 +222,8 @@ def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
         if k < MAX_VOTERS
         else f"at most {MAX_VOTERS:,} neighbors can vote"
     )
-    warnings.warn(f"k is {config.k:,}, but {reason}; the vote uses {k:,} neighbor{'s' * (k != 1)}", stacklevel=2)
+    used = f"the vote uses {k:,} neighbor{'s' * (k != 1)}"
+    warnings.warn(f"{option_name('k')} is {config.k:,}, but {reason}; {used}", stacklevel=2)
     return replace(config, k=k)
 
 
