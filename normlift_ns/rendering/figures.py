@@ -299,8 +299,8 @@ class FigureHeader:
         mask, scalars = finding.mask, finding.answer.field.scalars
         threshold, verdict = finding.answer.question.threshold, finding.verdict
         if not bool(mask.any()):
-            peak = "" if finding.peak is None else f"; the best match reaches {finding.peak:.2f}"
-            return FigureHeader(finding.text, f"no Gaussian is selected above {threshold:g}{peak}", verdict)
+            peak = "" if finding.peak is None else f", largest relevancy {finding.peak:.2f}"
+            return FigureHeader(finding.text, f"no Gaussian is selected (threshold {threshold:g}{peak})", verdict)
         views = float((evidence_weights(scalars, mask) * scalars.n_eff[mask].double()).sum())
         weak = float((scalars.reliability[mask] < WEAK_RELIABILITY).double().mean())
         evidence = f"evidence: R {finding.mean_reliability:.2f}, {views:.1f} views, {100 * weak:.0f} % weak"
