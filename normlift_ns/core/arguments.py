@@ -239,7 +239,7 @@ def _mapping_check(item: _Check) -> _Check:
 
 
 def _function_check(parts: Sequence[Any]) -> _Check:
-    """Return the check for a function argument: its number of parameters and, at every call, arrays that it returns."""
+    """Return the check of a function's number of parameters and, at every call, of an array that it returns."""
     arguments, result = [_check_of(hint) for hint in parts[0]], _check_of(parts[1])
 
     def check(name: str, value: Any, sizes: _Sizes) -> Any:

@@ -382,7 +382,7 @@ def _check_target(folder: Path, facts: Mapping[str, Any]) -> None:
 # The level is the k-th largest cosine between a Gaussian and the texts of the null vocabulary. Here, k is 3 % of the
 # number of texts, rounded, and at least 2. With many texts, a prompt above the level is therefore more similar than
 # about 97 % of them. If the null vocabulary consists of the texts of a scene, at most 83, only the most similar text is
-# above the level. docs/honest_answers.md compares other shares.
+# above the level. docs/honest_answers.md compares it with other thresholds.
 
 
 NULL_SHARE = 0.03

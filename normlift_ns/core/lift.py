@@ -1,4 +1,4 @@
-"""The lift, which computes direction and reliability of every Gaussian from evidence and unit features.
+"""The lift, which computes the direction and reliability of every Gaussian from evidence and unit features.
 
 Let E_js be the evidence of Gaussian j and F_s the unit feature of region s. Equation numbers are those of the paper::
 

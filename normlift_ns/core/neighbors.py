@@ -69,7 +69,7 @@ def nearest_neighbors(
 
     Args:
         of: Distinct indices of Gaussians to find neighbors for, one per row of the result (default: all n).
-        progress: Callback after every block of Gaussians, with the number that are done and their total.
+        progress: Callback after every block of Gaussians, with the number that are done and the total number.
         team: Processes that call this function together, each for a part of the same Gaussians (default: only this
             process).
     Raises:

@@ -74,7 +74,7 @@ def refine(
             all may change).
         neighbors: Result of `nearest_neighbors(means, config.k)`, to share one search among several votes (default:
             search for the K of `clamp_k(config, n)`).
-        progress: Callback after every block of Gaussians, with the number that are done and their total.
+        progress: Callback after every block of Gaussians, with the number that are done and the total number.
     Raises:
         ValueError: If shapes disagree, a direction is neither a unit vector nor 0, `reliability` or `own` is invalid,
             `neighbors` has an invalid index, or `own` is missing.

@@ -61,7 +61,7 @@ def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | Non
 
 
 def launch_processes(commands: Sequence[Sequence[str]], log: Callable[[str], None]) -> int:
-    """Run several processes on this machine that lift one scene together.
+    """Run several processes that lift one scene together on this machine.
 
     If a process fails, all others are terminated. Each process reports its own errors.
 
