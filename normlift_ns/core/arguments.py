@@ -10,6 +10,7 @@ from __future__ import annotations
 import builtins
 import inspect
 import math
+import re
 import sys
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -105,7 +106,7 @@ class _Names(dict[str, Any]):
 
 def _error(name: str, expected: str, value: Any) -> ArgumentError:
     shown = f"{value.dtype} {tuple(value.shape)}" if _layout(value) == "" else short_repr(value)
-    return ArgumentError(f"{name} must be {expected}, got {shown}")
+    return ArgumentError(f"{name} must be {expected}{';' if 'one of ' in expected else ','} got {shown}")
 
 
 def _anything(_name: str, value: Any, _sizes: _Sizes) -> Any:
@@ -138,7 +139,8 @@ def _plain_check(hint: Any) -> _Check:
         return _anything
     if (hint.__module__, hint.__name__) == ("torch", "Tensor"):
         return lambda name, value, _: as_tensor(name, value, "an array")
-    kind = {bool: "True or False", str: "a string", type(None): "None"}.get(hint, f"of type {hint.__name__}")
+    label = f"of type {'torch.' * (hint.__module__ == 'torch')}{hint.__name__}"
+    kind = {bool: "True or False", str: "a string", type(None): "None"}.get(hint, label)
     return _instance_check(lambda value: isinstance(value, hint), kind)
 
 
@@ -191,7 +193,7 @@ def _check_any(checks: Sequence[_Check], optional: bool, name: str, value: Any, 
         except InputError as error:
             if len(checks) == 1 or not str(error).startswith(start):  # an error about one item of the value
                 raise
-            expected.append(str(error).removeprefix(start).rpartition(", got ")[0])
+            expected.append(re.split("[,;] got ", str(error).removeprefix(start))[0])
     raise _error(name, " or ".join(dict.fromkeys(expected)), value)
 
 

@@ -96,7 +96,9 @@ class Evidence(TensorRecord):
             bool((self.region_view.diff() < 0).any())
             or not 0 <= int(self.region_view[0]) <= int(self.region_view[-1]) < self.num_views
         ):
-            raise InputError(f"Evidence.region_view must be non-decreasing, with values >= 0 and < {self.num_views}")
+            raise InputError(
+                f"Evidence.region_view must be non-decreasing, with values >= 0 and below num_views ({self.num_views})"
+            )
 
     @property
     def num_gaussians(self) -> int:

@@ -326,7 +326,7 @@ def choose_form(
     if not tolerance > 0:
         raise InputError(f"tolerance must be positive, got {tolerance}")
     if storage not in (*get_args(Storage), "auto"):
-        raise InputError(f"storage must be one of auto, {', '.join(get_args(Storage))}, got {storage!r}")
+        raise InputError(f"storage must be one of auto, {', '.join(get_args(Storage))}; got {storage!r}")
     communicator = None if portion is None else portion.communicator
     basis = smallest_basis(lifted, tolerance, communicator) if storage in ("auto", "low_rank") else None
     forms = sizes_and_bounds(lifted, basis, portion)

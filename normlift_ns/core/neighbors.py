@@ -84,7 +84,7 @@ def nearest_neighbors(
     if check_number("k", k, int) > MAX_NEIGHBORS:
         raise InputError(f"k must be at most {MAX_NEIGHBORS:,}, got {k:,}, because all neighbors are kept in memory")
     if of is not None:
-        check_rows("of", of, len(means))
+        check_rows('the indices "of"', of, len(means))
     neighbors = _on_gpu(means.detach(), k, of, progress, team) if can_use_triton(means) else None
     neighbors = _on_cpu(means, k, of, progress) if neighbors is None else neighbors
     if progress is not None:

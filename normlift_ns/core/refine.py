@@ -121,7 +121,7 @@ def _check_inputs(
 ) -> None:
     """Raise ValueError if an input of a vote is invalid or missing."""
     if posterior and own is None:
-        raise InputError("a posterior vote needs own, got None; pass scalars.own_evidence of the lift")
+        raise InputError("a posterior vote needs own, got None; pass own=lifted.scalars.own_evidence")
     check_not_negative("reliability", reliability)
     if posterior and own is not None:
         check_not_negative("own", own)

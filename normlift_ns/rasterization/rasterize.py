@@ -467,13 +467,12 @@ def _check_range(index: int, low: int, high: int, count: int | None) -> int:
         raise InputError(
             f"labels of view {index} contain {low}, expected region ids >= 0, -1 (unlabeled) or -2 (masked)"
         )
-    number = max(high, UNLABELED) + 1 if count is None else count
-    if not 0 <= number <= MAX_REGIONS:
-        found = f"{short_repr(number)}; number the regions of a view 0, 1, …"
-        raise InputError(f"num_regions of view {index} must be in 0..{MAX_REGIONS}, got {found}")
-    if high >= number:
-        raise InputError(f"labels of view {index} contain region {high}, expected ids below num_regions ({number})")
-    return number
+    if count is not None and not 0 <= count <= MAX_REGIONS:
+        raise InputError(f"num_regions of view {index} must be in 0..{MAX_REGIONS}, got {short_repr(count)}")
+    if high >= (MAX_REGIONS if count is None else count):
+        expected = f"{MAX_REGIONS}; number the regions of a view 0, 1, …" if count is None else f"num_regions ({count})"
+        raise InputError(f"labels of view {index} contain region {high}, expected ids below {expected}")
+    return max(high, UNLABELED) + 1 if count is None else count
 
 
 @check_arguments
