@@ -25,7 +25,9 @@ TORCHRUN_VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 """Environment variables that torchrun sets for distributed processes."""
 LAUNCHED_VARIABLE = "NORMLIFT_TEAM"
 """Environment variable that marks processes started by `launch_processes`, which reports their termination."""
-_RESUME_HINT = "2D features and evidence of finished views are saved; run the command again to continue."
+_RESUME_HINT = (
+    "Run the command again; unless --reuse-evidence is False, it reuses the 2D features and evidence of finished views."
+)
 _COLLECTIVE_TIMEOUT = timedelta(days=7)
 """Longest wait for other processes in a collective operation. Heartbeats detect lost processes earlier."""
 _JOIN_TIMEOUT = timedelta(minutes=10)
