@@ -1,7 +1,7 @@
 """Backend that uses stock gsplat on a GPU, and computes evidence as the gradient of its renders.
 
 With colors c_j and the image I_i = sum_j A_ij c_j, the gradient of sum_{i in s} I_i with respect to c_j is E_js. One
-backward pass with one-hot pixel gradients computes 32 regions. This backend runs only gsplat's own code, so it can
+backward pass with one-hot pixel gradients computes 32 regions. This backend runs gsplat's own kernels, so it can
 verify `rasterization.triton`. It is slower, and its results differ in their last bits between runs, because gsplat uses
 atomics.
 """
