@@ -444,8 +444,8 @@ def _zip_views(
         for name, item in zip(("cameras", "labels", "num_regions"), items):
             if item is end:
                 raise InputError(
-                    f"{name} has {index} item{'s' * (index != 1)}, but another argument has more; give one camera and "
-                    "one label map per view, and one number of regions per view or no num_regions"
+                    f"{name} has {index} item{'s' * (index != 1)}, but another argument has more; every view needs a "
+                    "camera, a label map and, if num_regions is given, a number of regions"
                 )
         yield items[0], items[1], items[2] if num_regions is not None else None
 
