@@ -10,10 +10,10 @@ from __future__ import annotations
 import builtins
 import inspect
 import math
+import re
 import sys
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from functools import cache, partial, wraps
 from itertools import chain, repeat
 from numbers import Integral, Real
@@ -106,7 +106,7 @@ class _Names(dict[str, Any]):
 
 def _error(name: str, expected: str, value: Any) -> ArgumentError:
     shown = f"{value.dtype} {tuple(value.shape)}" if _layout(value) == "" else short_repr(value)
-    return ArgumentError(f"{name} must be {expected}, got {shown}")
+    return ArgumentError(f"{name} must be {expected}{';' if 'one of ' in expected else ','} got {shown}")
 
 
 def _anything(_name: str, value: Any, _sizes: _Sizes) -> Any:
@@ -132,18 +132,22 @@ def _plain_check(hint: Any) -> _Check:
         return lambda name, value, _: check_path(name, value)
     if getattr(hint, "_is_protocol", False):
         members = {m for m in dir(hint) if not m.startswith("_")}
-        return _instance_check(lambda x: members <= {*dir(type(x)), *getattr(x, "__dict__", ())}, f"a {hint.__name__}")
+        return _instance_check(
+            lambda x: members <= {*dir(type(x)), *getattr(x, "__dict__", ())}, f"an implementation of {hint.__name__}"
+        )
     if hint in (Any, object) or not isinstance(hint, type) or is_typeddict(hint):
         return _anything
     if (hint.__module__, hint.__name__) == ("torch", "Tensor"):
         return lambda name, value, _: as_tensor(name, value, "an array")
-    kind = {bool: "True or False", str: "a string", type(None): "None"}.get(hint, f"of type {hint.__name__}")
+    label = f"of type {'torch.' * (hint.__module__ == 'torch')}{hint.__name__}"
+    kind = {bool: "True or False", str: "a string", type(None): "None"}.get(hint, label)
     return _instance_check(lambda value: isinstance(value, hint), kind)
 
 
 def _literal_check(words: Sequence[Any]) -> _Check:
     typed = [(type(word), word) for word in words]
-    return _instance_check(lambda value: (type(value), value) in typed, f"one of {', '.join(map(str, words))}")
+    expected = f"one of {', '.join(map(str, words))}" if len(words) != 1 else repr(words[0])
+    return _instance_check(lambda value: (type(value), value) in typed, expected)
 
 
 def _instance_check(accepts: Callable[[Any], bool], expected: str) -> _Check:
@@ -161,9 +165,11 @@ def _number_check(kind: type) -> _Check:
     def check(name: str, value: Any, _: _Sizes) -> Any:
         if type(value) is kind and (kind is int or not math.isnan(value)):
             return value
-        with suppress(OverflowError):  # raised if an integer is too large for a float
+        try:
             if isinstance(value, accepted) and not isinstance(value, bool) and not math.isnan(value):
                 return cast(Any, kind)(value)
+        except OverflowError:  # an integer that is too large for a float
+            raise _error(name, "a number that fits into float64", value) from None
         raise _error(name, expected, value)
 
     return check
@@ -187,8 +193,8 @@ def _check_any(checks: Sequence[_Check], optional: bool, name: str, value: Any, 
         except InputError as error:
             if len(checks) == 1 or not str(error).startswith(start):  # an error about one item of the value
                 raise
-            expected.append(str(error).removeprefix(start).rpartition(", got ")[0])
-    raise _error(name, " or ".join(expected), value)
+            expected.append(re.split("[,;] got ", str(error).removeprefix(start))[0])
+    raise _error(name, " or ".join(dict.fromkeys(expected)), value)
 
 
 def _list_check(origin: type, hint: Any) -> _Check:
@@ -235,7 +241,7 @@ def _mapping_check(item: _Check) -> _Check:
 
 
 def _function_check(parts: Sequence[Any]) -> _Check:
-    """Return the check for a function argument: its number of parameters and, at every call, arrays that it returns."""
+    """Return the check of a function's number of parameters and, at every call, of an array that it returns."""
     arguments, result = [_check_of(hint) for hint in parts[0]], _check_of(parts[1])
 
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
@@ -269,7 +275,10 @@ class _ArrayCheck:
         self.to_numpy, self.numpy = hint.array_type is np.ndarray, hint.array_type in (np.ndarray, Any)
 
     def __call__(self, name: str, value: Any, sizes: _Sizes) -> Any:
-        """Return the value as a tensor, or as a NumPy array if the annotation requires one, or accepts a given one."""
+        """Return the value as a tensor, or as a NumPy array if the annotation requires it.
+
+        NumPy arrays are not converted if the annotation accepts them.
+        """
         value = value if self.numpy and isinstance(value, np.ndarray) else self._convert(name, value)
         shape, more = tuple(value.shape), len(value.shape) - len(self.axes)
         if _kind_of(value.dtype) not in self.kinds or (more < -1 if self.wide else more != 0):

@@ -138,12 +138,14 @@ def check_consensus_inputs(size: int, features: Tensor, level: Tensor | None) ->
             raise InputError(f"{name} must have one row per region of the evidence ({size:,}), got {length:,}")
     if level is not None and bool((level < 0).any()):
         raise InputError(f"level must contain whole numbers >= 0, got {int(level.min())}")
-    check_unit_rows(features, "feature rows", "normalize them, or set those without a feature to 0", allow_zeros=True)
+    check_unit_rows(
+        features, "feature rows", "give rows of length 1, or of zeros for regions without a feature", allow_zeros=True
+    )
 
 
 def _check_numbers(power: float, sample: int, least: float) -> None:
     if not 0 <= power < float("inf"):
-        raise InputError(f"power must be a number >= 0, got {power!r}")
+        raise InputError(f"power must be >= 0 and finite, got {power!r}")
     if not 1 <= sample < 2**31:
         raise InputError(f"sample must be a whole number in 1..2147483647, got {sample!r}")
     if not 0 <= least <= 1:
@@ -212,8 +214,9 @@ def sample_gaussians(
 ) -> tuple[Int64[Tensor, " m"], Float64[Tensor, " m"]]:
     """Sample Gaussians until every region has at least `least` of them, or all of its Gaussians.
 
-    Each Gaussian has a pseudo-random number that depends only on its index. A region samples the Gaussians whose
-    number is below its share. Sums over the sample are unbiased if every term is divided by its sampling probability.
+    Each Gaussian has a pseudo-random number in [0, 1) that depends only on its index. A region samples its Gaussians
+    with a number below a limit, which is doubled as long as they are too few. Sums over the sample are unbiased if
+    every term is divided by its sampling probability.
 
     Args:
         portion: Partition of the Gaussians, if several processes lift the scene. `rows` then covers the Gaussians of

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from normlift_ns.errors import InputError
-from normlift_ns.options import check_device, option_setting
+from normlift_ns.options import check_device, option_name, option_setting
 
 MIN_TRITON_VERSION = 3
 Items = TypeVar("Items", Sequence, Tensor)
@@ -54,7 +54,7 @@ class TensorRecord:
 def has_triton() -> bool:
     """Return True if Triton 3 or newer is installed, or a Triton whose version is unknown.
 
-    torch 2.4 and later on Linux include it. Without Triton, the default backend on a GPU is gsplat.
+    torch 2.4 and later on Linux include it. Without Triton, the default backend on a GPU is gsplat or torch.
     """
     if find_spec("triton") is None:
         return False
@@ -175,12 +175,6 @@ def prefetch_map(function: Callable[[Item], Result], items: Iterable[Item], thre
             pool.shutdown(cancel_futures=True)
 
 
-_ADVICE = (
-    "close other programs that use the GPU, use a smaller model, downscale the images (--lift-downscale 2), or lift on "
-    "the CPU: --device cpu"
-)
-
-
 @dataclass
 class AdaptiveBatches:
     """Batched computation that reduces the batch size if a batch does not fit into GPU memory."""
@@ -197,11 +191,17 @@ class AdaptiveBatches:
         start = 0
         while start < len(items):
             batch = items[start : start + self.batch_size]
-            results = retry_in_halves(function, batch, _ADVICE)
+            results = retry_in_halves(function, batch, self._advice())
             if len(results) > 1:
                 self.batch_size = -(-len(batch) // len(results))
             start += len(batch)
             yield from results
+
+    def _advice(self) -> str:
+        return (
+            f"close other programs that use the GPU, use the CPU ({option_setting('device', 'cpu')}), or lift with a "
+            f"smaller model or smaller images (increase {option_name('lift_downscale')})"
+        )
 
     def map_across(
         self, function: Callable[[Sequence[Item]], Tensor], parts: Iterable[Sequence[Item]]

@@ -78,28 +78,27 @@ class Evidence(TensorRecord):
     """Number of Gaussians that were not drawn because a parameter was not finite or out of range."""
 
     def __post_init__(self) -> None:
-        _check_counts(self)
         offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight
         if offsets.numel() < 1 or int(offsets[-1]) != column.numel() or column.numel() != weight.numel():
-            end = f"its offsets end at {int(offsets[-1])}" if offsets.numel() > 0 else "its offsets are empty"
+            end = int(offsets[-1]) if offsets.numel() > 0 else "no offsets"
             raise InputError(
-                f"Evidence.rows is inconsistent: {end}, but there are {column.numel()} columns and {weight.numel()} "
-                "weights"
+                f"Evidence.rows must have offsets that end with the number of columns ({column.numel()}) and of "
+                f"weights ({weight.numel()}), got {end}"
             )
+        _check_counts(self)
         if len(self.unlabeled) != self.num_gaussians:
             raise InputError(
-                f"Evidence.unlabeled has {len(self.unlabeled)} rows, expected one per Gaussian ({self.num_gaussians})"
+                f"the number of rows of Evidence.unlabeled must be {self.num_gaussians}, one per Gaussian, got "
+                f"{len(self.unlabeled)}"
             )
-        if column.numel() > 0 and not (int(column.min()) >= 0 and int(column.max()) < self.num_regions):
-            raise InputError(
-                f"Evidence.rows.column must be in 0..{self.num_regions - 1}, found "
-                f"{int(column.min())}..{int(column.max())}"
-            )
+        check_rows("Evidence.rows.column", column, self.num_regions)
         if self.num_regions > 0 and (
             bool((self.region_view.diff() < 0).any())
             or not 0 <= int(self.region_view[0]) <= int(self.region_view[-1]) < self.num_views
         ):
-            raise InputError(f"Evidence.region_view must be non-decreasing, with values in 0..{self.num_views - 1}")
+            raise InputError(
+                f"Evidence.region_view must be non-decreasing, with values >= 0 and below num_views ({self.num_views})"
+            )
 
     @property
     def num_gaussians(self) -> int:
@@ -172,7 +171,7 @@ class Evidence(TensorRecord):
         """
         chosen = views.tolist() if isinstance(views, Tensor) else list(views)
         if len(set(chosen)) != len(chosen) or any(not 0 <= v < self.num_views for v in chosen):
-            raise InputError(f"views must be distinct and in 0..{self.num_views - 1}, got {chosen}")
+            raise InputError(f"views must be distinct and in 0..{self.num_views - 1}, got {short_repr(chosen)}")
         bounds = row_offsets(self.region_view, self.num_views).tolist()
         parts = [torch.arange(bounds[v], bounds[v + 1]) for v in chosen]
         return torch.cat([torch.zeros(0, dtype=torch.int64), *parts]).to(self.region_view.device)
@@ -262,9 +261,9 @@ class Evidence(TensorRecord):
         if not parts:
             raise InputError("Evidence.merge needs at least one part, got none")
         for name in ("num_gaussians", "weight_power", "num_excluded"):
-            values = [getattr(part, name) for part in parts]
-            if len(set(values)) > 1:
-                raise InputError(f"parts of Evidence.merge must have the same {name}, found {values}")
+            values = sorted({getattr(part, name) for part in parts})
+            if len(values) > 1:
+                raise InputError(f"parts of Evidence.merge must have the same {name}, found {short_repr(values)}")
         views = torch.tensor([0, *(part.num_views for part in parts)]).cumsum(0).tolist()
         regions = torch.tensor([0, *(part.num_regions for part in parts)]).cumsum(0).tolist()
         rows = SparseRows.append_columns([part.rows for part in parts], regions)
@@ -323,7 +322,7 @@ class Evidence(TensorRecord):
 
 
 def check_not_negative(name: str, values: Tensor) -> None:
-    """Raise ValueError with the number of invalid values and an example if a value is negative or not finite.
+    """Raise ValueError with the number of invalid values and the first one if a value is negative or not finite.
 
     >>> check_not_negative("reliability", torch.tensor([0.0, 1.0]))
     """
@@ -332,7 +331,7 @@ def check_not_negative(name: str, values: Tensor) -> None:
         first = int(bad[0, 0])
         raise InputError(
             f"{len(bad):,} of {values.numel():,} values of {name} {'is' if len(bad) == 1 else 'are'} negative or not "
-            f"finite, for example {name}[{first}] = {float(values[first]):g}"
+            f"finite; the first is {name}[{first}] = {float(values[first]):g}"
         )
 
 
@@ -347,7 +346,8 @@ def _check_entries(name: str, part: Entries, num_gaussians: int) -> None:
     counts = part.num_regions
     if not all(0 <= count < 2**31 for count in counts) or sum(counts) + len(counts) >= 2**31:
         raise InputError(
-            f"{name}.num_regions must contain counts >= 0 whose sum fits into 31 bits, got {short_repr(counts)}"
+            f"{name}.num_regions must contain counts >= 0 whose sum plus the number of views is below 2**31, got "
+            f"{short_repr(counts)}"
         )
     check_rows(f"{name}.gaussian", part.gaussian, num_gaussians)
     check_rows(f"{name}.column", part.column, sum(counts) + len(counts))

@@ -72,8 +72,7 @@ class SemanticField(TensorRecord):
     means: Float[Tensor, "n 3"] | None = None
     """Centers of the Gaussians at the time of the lift, float32; None in fields of version 0.1."""
     null_level: Float[Tensor, " n"] | None = None
-    """Null level of every Gaussian's own direction (see `with_null_level`), or None if the encoder has no null
-    vocabulary."""
+    """Null level of every Gaussian's own direction (see `with_null_level`), or None without a null vocabulary."""
 
     def __len__(self) -> int:
         return self.source.numel()
@@ -327,7 +326,7 @@ def choose_form(
     if not tolerance > 0:
         raise InputError(f"tolerance must be positive, got {tolerance}")
     if storage not in (*get_args(Storage), "auto"):
-        raise InputError(f"storage must be one of auto, {', '.join(get_args(Storage))}, got {storage!r}")
+        raise InputError(f"storage must be one of auto, {', '.join(get_args(Storage))}; got {storage!r}")
     communicator = None if portion is None else portion.communicator
     basis = smallest_basis(lifted, tolerance, communicator) if storage in ("auto", "low_rank") else None
     forms = sizes_and_bounds(lifted, basis, portion)
@@ -383,7 +382,7 @@ def _check_target(folder: Path, facts: Mapping[str, Any]) -> None:
 # The level is the k-th largest cosine between a Gaussian and the texts of the null vocabulary. Here, k is 3 % of the
 # number of texts, rounded, and at least 2. With many texts, a prompt above the level is therefore more similar than
 # about 97 % of them. If the null vocabulary consists of the texts of a scene, at most 83, only the most similar text is
-# above the level. docs/honest_answers.md compares other shares.
+# above the level. docs/honest_answers.md compares it with other thresholds.
 
 
 NULL_SHARE = 0.03

@@ -1,4 +1,4 @@
-"""The two inputs of every lift: a trained Gaussian scene and the cameras of its images."""
+"""Inputs of the rasterizer: a trained Gaussian scene and the cameras of its images."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ If the consensus is enabled, these directions follow a consensus among the kept 
     V_s        = sum_t J_st F_t                                 over the kept regions t with J_st > 0.3
     recognized = U_s is nearer to F_s than to the feature of any other region of the same view and level
     confirmed  = V_s is nearer to F_s than to the feature of any other region of the same view and level
-    agreement  = mean over all regions s of <U_s, F'_s>         F' from a consensus among the left-out views alone
+    agreement  = mean of <U_s, F'_s> over the regions s         F' from a consensus among the left-out views alone
 
 Recognition is measured for confirmed regions only. A region without a similar region in other views, such as a wrong or
 merged mask, should not be recognized. Regions without a feature, or whose Gaussians have no direction, do not count.

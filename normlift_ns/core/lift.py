@@ -1,4 +1,4 @@
-"""The lift, which computes direction and reliability of every Gaussian from evidence and unit features.
+"""The lift, which computes the direction and reliability of every Gaussian from evidence and unit features.
 
 Let E_js be the evidence of Gaussian j and F_s the unit feature of region s. Equation numbers are those of the paper::
 
@@ -66,7 +66,7 @@ class Scalars(TensorRecord):
     reliability: Float[Tensor, " n"]
     """Reliability R_j, in 0..1."""
     weight: Float[Tensor, " n"]
-    """W_j, the sum of the Gaussian's weights over all views, by which the sum of its features is divided."""
+    """W_j, the sum of W_jv over all views, by which the weighted sum of the features is divided."""
     view_count: Int32[Tensor, " n"]
     """Number of views in which the Gaussian has weight."""
 
@@ -202,7 +202,7 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
             f"{features.dtype} {tuple(features.shape)}"
         )
     exact = features.to(evidence.rows.weight.device, torch.float64)
-    length = check_unit_rows(exact, "feature rows", "normalize them, and set labels of regions without a feature to -1")
+    length = check_unit_rows(exact, "feature rows", "give rows of length 1, and label regions without a feature -1")
     double = torch.float64 in (evidence.rows.weight.dtype, features.dtype)
     return (exact / length[:, None]).to(torch.float64 if double else torch.float32)
 
@@ -270,7 +270,7 @@ def check_unit_rows(
         ValueError: If a row has the wrong length or is not finite. The message gives the number of these rows and up to
             three examples.
 
-    >>> check_unit_rows(torch.tensor([[0.6, 0.8]]), "feature rows", "normalize them").round(decimals=6)
+    >>> check_unit_rows(torch.tensor([[0.6, 0.8]]), "feature rows", "normalize").round(decimals=6)
     tensor([1.], dtype=torch.float64)
     """
     blocks = rows.split(max(1, CHUNK_ELEMENTS // max(1, rows.shape[1])))  # rows in float64 would double the memory

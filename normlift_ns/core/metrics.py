@@ -153,7 +153,7 @@ def bin_means(
         ValueError: If there are fewer points than bins.
     """
     if len(key) < bins:
-        raise InputError(f"{bins} bins need at least one point each, got {len(key)} points")
+        raise InputError(f"{bins} bins need at least {bins} points, got {len(key)}")
     parts = key.argsort(stable=True).tensor_split(bins)
     return tuple(torch.stack([x.double()[part].mean() for part in parts]) for x in (key, values))  # type: ignore[return-value]
 

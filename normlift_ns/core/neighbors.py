@@ -69,7 +69,7 @@ def nearest_neighbors(
 
     Args:
         of: Distinct indices of Gaussians to find neighbors for, one per row of the result (default: all n).
-        progress: Callback after every block of Gaussians, with the number that are done and their total.
+        progress: Callback after every block of Gaussians, with the number that are done and the total number.
         team: Processes that call this function together, each for a part of the same Gaussians (default: only this
             process).
     Raises:
@@ -84,7 +84,7 @@ def nearest_neighbors(
     if check_number("k", k, int) > MAX_NEIGHBORS:
         raise InputError(f"k must be at most {MAX_NEIGHBORS:,}, got {k:,}, because all neighbors are kept in memory")
     if of is not None:
-        check_rows("of", of, len(means))
+        check_rows('the indices "of"', of, len(means))
     neighbors = _on_gpu(means.detach(), k, of, progress, team) if can_use_triton(means) else None
     neighbors = _on_cpu(means, k, of, progress) if neighbors is None else neighbors
     if progress is not None:

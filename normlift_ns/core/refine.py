@@ -20,7 +20,7 @@ from normlift_ns.core.neighbors import Neighbors, Progress, nearest_neighbors
 from normlift_ns.core.partition import PARTITION_BLOCK, spatial_order
 from normlift_ns.core.sparse import SparseRows, sum_equal_keys
 from normlift_ns.errors import InputError
-from normlift_ns.options import RefineConfig
+from normlift_ns.options import RefineConfig, option_name
 
 _CHUNK_ELEMENTS = (2**22, 2**24)
 """Number of elements of the largest tensor of a vote in torch, on CPU and GPU. The CPU limit suits its caches."""
@@ -74,7 +74,7 @@ def refine(
             all may change).
         neighbors: Result of `nearest_neighbors(means, config.k)`, to share one search among several votes (default:
             search for the K of `clamp_k(config, n)`).
-        progress: Callback after every block of Gaussians, with the number that are done and their total.
+        progress: Callback after every block of Gaussians, with the number that are done and the total number.
     Raises:
         ValueError: If shapes disagree, a direction is neither a unit vector nor 0, `reliability` or `own` is invalid,
             `neighbors` has an invalid index, or `own` is missing.
@@ -121,12 +121,12 @@ def _check_inputs(
 ) -> None:
     """Raise ValueError if an input of a vote is invalid or missing."""
     if posterior and own is None:
-        raise InputError("a posterior vote needs own, got None; pass scalars.own_evidence of the lift")
+        raise InputError("a posterior vote needs own, got None; pass own=lifted.scalars.own_evidence")
     check_not_negative("reliability", reliability)
     if posterior and own is not None:
         check_not_negative("own", own)
     if isinstance(directions, Tensor):
-        advice = "normalize them, or set those without a direction to 0"
+        advice = "give rows of length 1, or of zeros for Gaussians without a direction"
         check_unit_rows(directions, "rows of directions", advice, allow_zeros=True)
 
 
@@ -222,7 +222,8 @@ def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
         if k < MAX_VOTERS
         else f"at most {MAX_VOTERS:,} neighbors can vote"
     )
-    warnings.warn(f"k is {config.k:,}, but {reason}; the vote uses {k:,} neighbor{'s' * (k != 1)}", stacklevel=2)
+    used = f"the vote uses {k:,} neighbor{'s' * (k != 1)}"
+    warnings.warn(f"{option_name('k')} is {config.k:,}, but {reason}; {used}", stacklevel=2)
     return replace(config, k=k)
 
 

@@ -153,7 +153,7 @@ def _relevancy(positive: Any, negative: Any, rule: RelevancyRule, temperature: f
     if rule == "contrast" and (negative is None or negative.shape[-1] == 0):
         raise InputError(
             'rule "contrast" needs the null levels of a lift that compared the scene with unrelated words, got none; '
-            'lift again, or choose rule "cosine"'
+            'choose rule "cosine", or lift again if the lift is from an earlier version'
         )
     if RELEVANCY_RULES[rule].needs_negatives and (negative is None or negative.shape[-1] == 0):
         raise InputError(

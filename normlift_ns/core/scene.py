@@ -43,7 +43,7 @@ class View(NamedTuple):
 
     @check_arguments
     def downscaled(self, height: int, width: int) -> View:
-        """Downscale the image and its camera by averaging pixels.
+        """Downscale the image by averaging pixels, and adapt its camera.
 
         A pixel of the mask is True only if it is True for all averaged pixels.
         """

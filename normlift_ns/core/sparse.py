@@ -13,6 +13,7 @@ from torch.nn.functional import embedding_bag
 
 from normlift_ns.core.device import TensorRecord, can_use_triton
 from normlift_ns.errors import InputError
+from normlift_ns.options import short_repr
 
 CANCELLATION_RATIO = 1e-3
 """Vector sums shorter than this share of the sum of their weights are recomputed in float64, because they lose digits
@@ -116,8 +117,8 @@ class SparseRows(TensorRecord):
         ends = [int(self.offsets[0]), int(self.offsets[-1])] if self.offsets.numel() > 0 else []
         if ends != [0, size] or self.weight.numel() != size or bool((lengths < 0).any()):
             raise InputError(
-                "row offsets must begin with 0, never decrease, and end with the number of entries; the first and last "
-                f"are {ends}, for {size} columns and {self.weight.numel()} weights"
+                f"row offsets must begin with 0, never decrease, and end with the number of columns ({size}) and of "
+                f"weights ({self.weight.numel()}), got {short_repr(self.offsets.tolist())}"
             )
         low, high = (int(x) for x in self.column.aminmax()) if size > 0 else (0, -1)
         if low < 0:
@@ -164,7 +165,7 @@ class SparseRows(TensorRecord):
             return torch.stack(columns, dim=1)
         if table.device.type == "cpu" and table.shape[1] <= _MAX_NARROW_COLUMNS:  # ten times as fast as embedding_bag
             if self.num_columns > len(table):
-                raise InputError(f"the table needs one row for each of {self.num_columns} columns, got {len(table)}")
+                raise InputError(f"the table needs one row per column ({self.num_columns}), got {len(table)}")
             offsets = self.offsets.int() if self.weight.numel() < 2**31 else self.offsets
             arrays = (x.numpy() for x in (self.weight, self.column, offsets))
             from scipy.sparse import csr_array  # noqa: PLC0415 (not needed on a GPU)

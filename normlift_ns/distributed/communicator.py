@@ -136,7 +136,7 @@ class TorchCommunicator(Communicator):
             raise InputError(
                 f"{creators} of {self.world_size} processes created the same file in {folder}, expected 1. The "
                 "processes do not share that folder, or its file system does not support exclusive creation. Start all "
-                "processes with the same --output-dir, on a disk that they share"
+                "processes with the same --output-dir, on a shared file system that supports exclusive creation"
             )
         try:
             yield

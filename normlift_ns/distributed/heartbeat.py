@@ -33,7 +33,7 @@ class PeerFailure(NamedTuple):
     reported: bool
     """True if the process failed and reported its error, False if its heartbeat stopped."""
     host: str
-    """Host name and process id."""
+    """Host name and process id, or "host unknown"."""
 
 
 @dataclass

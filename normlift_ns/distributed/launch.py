@@ -25,7 +25,9 @@ TORCHRUN_VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 """Environment variables that torchrun sets for distributed processes."""
 LAUNCHED_VARIABLE = "NORMLIFT_TEAM"
 """Environment variable that marks processes started by `launch_processes`, which reports their termination."""
-_RESUME_HINT = "2D features and evidence of finished views are saved; run the command again to continue."
+_RESUME_HINT = (
+    "Run the command again; unless --reuse-evidence is False, it reuses the 2D features and evidence of finished views."
+)
 _COLLECTIVE_TIMEOUT = timedelta(days=7)
 """Longest wait for other processes in a collective operation. Heartbeats detect lost processes earlier."""
 _JOIN_TIMEOUT = timedelta(minutes=10)
@@ -61,7 +63,7 @@ def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | Non
 
 
 def launch_processes(commands: Sequence[Sequence[str]], log: Callable[[str], None]) -> int:
-    """Run several processes on this machine that lift one scene together.
+    """Run several processes that lift one scene together on this machine.
 
     If a process fails, all others are terminated. Each process reports its own errors.
 
@@ -105,7 +107,7 @@ def _watch(processes: Sequence[subprocess.Popen[bytes]], log: Callable[[str], No
         codes = [process.poll() for process in processes]
         rank, code = next(((r, code) for r, code in enumerate(codes) if code), (0, 0))
         if code < 0:
-            log(f"Process {rank} (of 0..{len(processes) - 1}) was killed by {describe_signal(-code)}. {_RESUME_HINT}")
+            log(f"Process {rank} (counted from 0) was killed by {describe_signal(-code)}. {_RESUME_HINT}")
         if code != 0 or all(code == 0 for code in codes):
             return max(code, int(code != 0))
         time.sleep(0.1)
@@ -248,12 +250,13 @@ def _connect(rank: int, size: int, backend: str, log: Callable[[str], None]) -> 
         heart = Heartbeat(heart_store, rank, size, lambda lost: log(describe_failure(lost)))
     except TimeoutError as error:
         raise InputError(
-            f"process {rank} of {size} waited {_JOIN_TIMEOUT} for {error}; check that all processes were started"
+            f"process {rank} waited {_JOIN_TIMEOUT.seconds // 60} minutes for {error}; check that all processes were "
+            "started and that no firewall blocks them"
         ) from error
     except (RuntimeError, OSError) as error:
         raise InputError(
-            f"process {rank} of {size} cannot connect to the others at {host}:{port} ({str(error).splitlines()[0]}); "
-            "check that all processes were started and that no firewall blocks them"
+            f"process {rank} cannot connect to the others at {host}:{port} ({str(error).partition(chr(10))[0]}); check "
+            "that no other program uses the port, all processes were started, and no firewall blocks them"
         ) from error
     heart.start()
     return PrefixStore("counts", store), heart

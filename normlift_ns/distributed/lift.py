@@ -224,7 +224,7 @@ def build_field_distributed(
     storage: str,
     provenance: Mapping[str, Any],
 ) -> SemanticField | None:
-    """Run `SemanticField.build` in several processes; return the field in process 0, and None in all others.
+    """Run `SemanticField.build` in several processes; return the field in process 0, and None in the others.
 
     Args:
         lifted: Lift of this process's Gaussians.
@@ -246,7 +246,7 @@ def build_field_distributed(
 
 
 def _gather_evidence(lifted: Lifted, portion: Partition) -> lowrank.StoredEvidence | None:
-    """Return the evidence E and the features F of all partitions in process 0, and None in all others."""
+    """Return the evidence E and the features F of all partitions in process 0, and None in all other processes."""
     rows, unlabeled = (gather_sparse(portion, x) for x in (lifted.evidence.rows, lifted.evidence.unlabeled))
     if rows is None or unlabeled is None:
         return None
@@ -254,7 +254,7 @@ def _gather_evidence(lifted: Lifted, portion: Partition) -> lowrank.StoredEviden
 
 
 def _gather_directions(lifted: Lifted, basis: Tensor | None, portion: Partition) -> lowrank.StoredDirections | None:
-    """Return the directions of all Gaussians with evidence in process 0, and None in all others."""
+    """Return the directions of all Gaussians that have one in process 0, and None in all other processes."""
     coordinates, rows = lowrank.encode_directions(lifted, basis, portion.blocks())
     parts, gaussians = portion.communicator.gather(coordinates), portion.communicator.gather(portion.indices[rows])
     if parts is None or gaussians is None:

@@ -1,7 +1,7 @@
 """Backend that uses stock gsplat on a GPU, and computes evidence as the gradient of its renders.
 
 With colors c_j and the image I_i = sum_j A_ij c_j, the gradient of sum_{i in s} I_i with respect to c_j is E_js. One
-backward pass with one-hot pixel gradients computes 32 regions. This backend runs only gsplat's own code, so it can
+backward pass with one-hot pixel gradients computes 32 regions. This backend runs gsplat's own kernels, so it can
 verify `rasterization.triton`. It is slower, and its results differ in their last bits between runs, because gsplat uses
 atomics.
 """
@@ -21,7 +21,7 @@ from normlift_ns.core.evidence import Entries
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.core.sparse import sum_duplicates
 from normlift_ns.errors import InputError
-from normlift_ns.options import GSPLAT_VERSIONS
+from normlift_ns.options import GSPLAT_VERSIONS, option_setting
 from normlift_ns.rasterization.projection import camera_depths, prepare_gaussians, project
 from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob, check_gpu
 from normlift_ns.rasterization.settings import RasterSettings
@@ -126,10 +126,13 @@ def check(job: RasterJob) -> None:
     check_gpu("gsplat", job)
     if job.weight_power != 1:
         raise InputError(
-            f'backend "gsplat" needs weight_power 1, got {job.weight_power}; use backend="auto" for other powers'
+            f'backend "gsplat" needs weight_power 1, got {job.weight_power}; use '
+            f"{option_setting('backend', 'auto')} for other powers"
         )
     if job.is_2d:
-        raise InputError('backend "gsplat" draws 3D Gaussians only; use backend="auto" for 2D Gaussians')
+        raise InputError(
+            f'backend "gsplat" draws 3D Gaussians only; use {option_setting("backend", "auto")} for 2D Gaussians'
+        )
     compiled = installed_settings()
     squares = compiled.per_axis and not job.settings.per_axis
     names = _COMPILED if squares else (*_COMPILED, *_EXTENT)
@@ -137,7 +140,7 @@ def check(job: RasterJob) -> None:
     if len(different) > 0:
         raise InputError(
             f"gsplat {installed_gsplat_version()} is compiled with other values of {', '.join(different)} than the "
-            'scene needs; use backend="triton" or "torch", which support every gsplat version'
+            f"scene needs; use {option_setting('backend', 'triton')} or {option_setting('backend', 'torch')}"
         )
 
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from normlift_ns.core.evidence import UNLABELED, Entries
 from normlift_ns.core.gaussians import Camera
 from normlift_ns.errors import InputError
+from normlift_ns.options import option_setting
 from normlift_ns.rasterization.projection import AnyProjected, ProjectedGaussians2D
 from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob
 from normlift_ns.rasterization.settings import RasterSettings
@@ -33,7 +34,8 @@ def check(job: RasterJob) -> None:
     device = job.scene.means.device
     if device.type != "cpu":
         raise InputError(
-            f'backend "numba" needs a scene on the CPU, got {device}; move the scene, or use backend="auto"'
+            f'backend "numba" needs a scene on the CPU, got {device}; move the scene, or use '
+            f"{option_setting('backend', 'auto')}"
         )
 
 

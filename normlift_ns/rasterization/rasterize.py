@@ -22,7 +22,7 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.errors import InputError
-from normlift_ns.options import BackendName, RasterizeMode, short_repr
+from normlift_ns.options import BackendName, RasterizeMode, option_name, option_setting, short_repr
 from normlift_ns.rasterization import projection
 from normlift_ns.rasterization.settings import RasterSettings
 
@@ -65,8 +65,8 @@ def check_gpu(backend: str, job: RasterJob) -> None:
     if not means.dtype == job.dtype == torch.float32 or means.device.type != "cuda":
         other = str(job.dtype if means.dtype == torch.float32 else means.dtype).removeprefix("torch.")
         raise InputError(
-            f'backend "{backend}" needs float32 on a GPU, got {other} on {means.device.type}; use backend="auto" to '
-            "choose a backend that supports these"
+            f'backend "{backend}" needs float32 on a GPU, got {other} on {means.device.type}; use '
+            f"{option_setting('backend', 'auto')}"
         )
 
 
@@ -146,7 +146,8 @@ def choose_backend(name: str, job: RasterJob) -> tuple[str, Backend]:
         raise InputError(f"backend {name!r} is unknown; choose one of {', '.join(get_args(BackendName))}")
     if name == "triton" and not has_triton():
         raise InputError(
-            'backend "triton" needs Triton 3, which PyTorch 2.4 and later on Linux include; use backend="auto"'
+            'backend "triton" needs Triton 3, which PyTorch 2.4 and later on Linux include; use '
+            f"{option_setting('backend', 'auto')}"
         )
     backend: Any = TileBackend() if name == "torch" else import_module(f"normlift_ns.rasterization.{name}")
     backend.check(job)
@@ -170,7 +171,6 @@ def _fastest(job: RasterJob) -> str:
 ViewProgress = Callable[[int, int | None], None]
 MAX_REGIONS = 2**24
 """Largest number of regions of a view. Regions without pixels also take memory."""
-_ADVICE = "rasterize at a lower resolution (ns-normlift --lift-downscale 2) or on the CPU (--device cpu)"
 
 
 class RasterOptions(TypedDict, total=False):
@@ -267,7 +267,8 @@ def rasterize_evidence(
                 on_device = [labels.to(scene.means.device, torch.int32) for labels in label_maps]
                 return chosen.views_evidence(job, RasterBatch(view_cameras, on_device, counts))
 
-            parts += retry_in_halves(sums, checked, _ADVICE)
+            advice = f"rasterize smaller images (in a lift, increase {option_name('lift_downscale')}) or use the CPU"
+            parts += retry_in_halves(sums, checked, advice)
             for _ in batch:
                 done += 1
                 if progress is not None:
@@ -412,15 +413,14 @@ def _job(
     if rasterize_mode not in ("classic", "antialiased"):
         raise InputError(f'rasterize_mode must be "classic" or "antialiased", got {rasterize_mode!r}')
     if (dtype := dtype or scene.means.dtype) not in (torch.float32, torch.float64):
-        raise InputError(
-            f"dtype must be torch.float32 or torch.float64, got {dtype}; for a {dtype} scene, pass dtype=torch.float32"
-        )
+        raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}; pass dtype=torch.float32")
     job = RasterJob(scene, rasterize_mode == "antialiased", settings or RasterSettings(), dtype, weight_power)
     if job.is_2d and job.antialiased:
         raise InputError('2D Gaussians need rasterize_mode "classic", got "antialiased"')
     if job.is_2d and job.settings.per_axis:
         raise InputError(
-            "2D Gaussians need the rules of gsplat 1.4, got those of a later version; give gsplat_version 1.4"
+            "2D Gaussians need the rules of gsplat 1.4, got those of a later version; use "
+            f"{option_setting('gsplat_version', '1.4')}"
         )
     return job
 
@@ -444,8 +444,8 @@ def _zip_views(
         for name, item in zip(("cameras", "labels", "num_regions"), items):
             if item is end:
                 raise InputError(
-                    f"{name} ends after {index} view{'s' * (index != 1)}, before the other arguments; give one camera "
-                    "and one label map per view, and one number of regions per view or no num_regions"
+                    f"{name} has {index} item{'s' * (index != 1)}, but another argument has more; every view needs a "
+                    "camera, a label map and, if num_regions is given, a number of regions"
                 )
         yield items[0], items[1], items[2] if num_regions is not None else None
 
@@ -467,13 +467,12 @@ def _check_range(index: int, low: int, high: int, count: int | None) -> int:
         raise InputError(
             f"labels of view {index} contain {low}, expected region ids >= 0, -1 (unlabeled) or -2 (masked)"
         )
-    if count is not None and high >= count:
-        raise InputError(f"labels of view {index} contain region {high}, expected ids below num_regions ({count})")
-    count = max(high, UNLABELED) + 1 if count is None else count
-    if not 0 <= count <= MAX_REGIONS:
-        found = f"{short_repr(count)}; number the regions of a view 0, 1, …"
-        raise InputError(f"num_regions of view {index} must be in 0..{MAX_REGIONS}, got {found}")
-    return count
+    if count is not None and not 0 <= count <= MAX_REGIONS:
+        raise InputError(f"num_regions of view {index} must be in 0..{MAX_REGIONS}, got {short_repr(count)}")
+    if high >= (MAX_REGIONS if count is None else count):
+        expected = f"{MAX_REGIONS}; number the regions of a view 0, 1, …" if count is None else f"num_regions ({count})"
+        raise InputError(f"labels of view {index} contain region {high}, expected ids below {expected}")
+    return max(high, UNLABELED) + 1 if count is None else count
 
 
 @check_arguments

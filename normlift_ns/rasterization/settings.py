@@ -62,9 +62,10 @@ class RasterSettings:
 
     def __post_init__(self) -> None:
         for name, low, high in (
-            ("near_plane", 0.0, self.far_plane), ("eps2d", 0.0, 1e6), ("frustum_margin", 0.0, 1e6),
-            ("min_discriminant", 0.0, 1e6), ("min_compensation", 0.0, 1.0), ("radius_sigmas", 0.0, 1e6),
-            ("tile_size", 1, 2**15), ("max_alpha", 0.0, 1.0), ("min_alpha", 0.0, 1.0), ("min_transmittance", 0.0, 1.0),
+            ("far_plane", 0.0, float("inf")), ("near_plane", 0.0, self.far_plane), ("eps2d", 0.0, 1e6),
+            ("frustum_margin", 0.0, 1e6), ("min_discriminant", 0.0, 1e6), ("min_compensation", 0.0, 1.0),
+            ("radius_sigmas", 0.0, 1e6), ("tile_size", 1, 2**15), ("max_alpha", 0.0, 1.0), ("min_alpha", 0.0, 1.0),
+            ("min_transmittance", 0.0, 1.0),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"{name} must be in {low:g}..{high:g}, got {getattr(self, name)}")
@@ -85,7 +86,9 @@ class RasterSettings:
         """
         minor = ".".join(version.split(".")[:2])
         if minor not in GSPLAT_VERSIONS:
-            raise InputError(f"gsplat version {version} is not supported; choose one of {', '.join(GSPLAT_VERSIONS)}")
+            raise InputError(
+                f"gsplat version {version!r} is not supported, expected one of {', '.join(GSPLAT_VERSIONS)}"
+            )
         if minor == "1.4":
             return RasterSettings()
         rectangle = RasterSettings(per_axis=True, radius_sigmas=3.33)

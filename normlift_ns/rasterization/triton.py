@@ -18,7 +18,7 @@ from normlift_ns.kernels import compositing as kernel
 from normlift_ns.kernels.compositing import AlphaLimits, CellGrid, CellLists, build_cell_lists, decode_keys, sum_regions
 from normlift_ns.kernels.projection import SPLAT, ProjectedSplats, ProjectionSettings, project_gaussians
 from normlift_ns.kernels.projection_2dgs import SPLAT_2D, Settings2D, project_gaussians_2d
-from normlift_ns.options import RasterizeMode
+from normlift_ns.options import RasterizeMode, option_setting
 from normlift_ns.rasterization.rasterize import RasterBatch, RasterJob, check_gpu
 from normlift_ns.rasterization.settings import RasterSettings
 
@@ -45,7 +45,10 @@ def check(job: RasterJob) -> None:
     size = job.settings.tile_size
     check_gpu("triton", job)
     if size < 1 or size & (size - 1) != 0:
-        raise InputError(f'backend "triton" needs a tile_size that is a power of two, got {size}; use backend="torch"')
+        raise InputError(
+            f'backend "triton" needs a tile_size that is a power of two, got {size}; use '
+            f"{option_setting('backend', 'torch')}"
+        )
 
 
 def project_and_bin(

@@ -209,7 +209,7 @@ def overlay(
 def relevancy_map(
     display: Display, rgb: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """Color all pixels by relevancy over the scene in gray, from transparent to opaque."""
+    """Color all pixels by relevancy over the scene in gray; opacity increases with relevancy."""
     ramp = colors.colormap_rgb(display.colormap).to(rgb)
     color, opacity = colors.apply_colormap(relevancy, display.map_scale, ramp, min_opacity=0.0)
     return _over_gray(rgb, color, (alpha.clamp(0, 1) * opacity)[:, :, None])
@@ -299,8 +299,8 @@ class FigureHeader:
         mask, scalars = finding.mask, finding.answer.field.scalars
         threshold, verdict = finding.answer.question.threshold, finding.verdict
         if not bool(mask.any()):
-            peak = "" if finding.peak is None else f"; the best match reaches {finding.peak:.2f}"
-            return FigureHeader(finding.text, f"no Gaussian is selected above {threshold:g}{peak}", verdict)
+            peak = "" if finding.peak is None else f", largest relevancy {finding.peak:.2f}"
+            return FigureHeader(finding.text, f"no Gaussian is selected (threshold {threshold:g}{peak})", verdict)
         views = float((evidence_weights(scalars, mask) * scalars.n_eff[mask].double()).sum())
         weak = float((scalars.reliability[mask] < WEAK_RELIABILITY).double().mean())
         evidence = f"evidence: R {finding.mean_reliability:.2f}, {views:.1f} views, {100 * weak:.0f} % weak"
@@ -558,13 +558,12 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
         matches = matches or [i for i, image in enumerate(images) if PurePosixPath(image).stem == name]
         if len(matches) == 0:
             raise InputError(
-                f"--render-views: the scene has no training image {name!r}. Expected one of {len(images)} names from "
-                f"{unique[0]!r} to {unique[-1]!r}, without suffix. Images held out for evaluation are not available."
+                f"the scene has no training image {name!r}. Its training images ({len(images)}) are named "
+                f"{unique[0]!r} to {unique[-1]!r}. Images held out for evaluation are not available."
             )
         if len(matches) > 1:
             raise InputError(
-                f"--render-views: {len(matches)} training images match {name!r}. Choose one of: "
-                f"{', '.join(unique[i] for i in matches)}"
+                f"{len(matches)} training images match {name!r}. Choose one of: {', '.join(unique[i] for i in matches)}"
             )
         selected[unique[matches[0]]] = cameras[matches[0]]
     return selected

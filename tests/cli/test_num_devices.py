@@ -55,7 +55,7 @@ def test_a_process_that_is_killed_ends_all_and_three_write_the_files_of_one(made
     _, said = process.communicate(timeout=120)
     if killed:
         assert process.returncode == 1
-        assert "Process 1 (of 0..1)" in said and "SIGKILL" in said and "Traceback" not in said
+        assert "Process 1 (counted from 0)" in said and "SIGKILL" in said and "Traceback" not in said
     for again in (started(output, 3, "--overwrite", "True"), started(alone, 1)):
         out, said = again.communicate(timeout=400)
         assert again.returncode == 0, said

@@ -53,7 +53,7 @@ def test_batches_are_filled_from_several_parts(counts, size):
         assert first[len(asked) - 1] < first[i] + counts[i] + size  # no part is asked for without need
     assert asked == list(range(len(counts)))
     assert sizes == [size] * -(-sum(counts) // size)
-    with pytest.raises(MemoryError, match=r"CUDA out of memory.*2 GiB.*--lift-downscale 2"):
+    with pytest.raises(MemoryError, match=r"CUDA out of memory.*2 GiB.*lift_downscale"):
         list(AdaptiveBatches(16)(narrow(0)[0], torch.arange(10)))
     with pytest.raises(ZeroDivisionError):
         list(AdaptiveBatches(2)(lambda items: 1 // 0, torch.arange(3)))

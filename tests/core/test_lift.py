@@ -141,8 +141,7 @@ def test_unlabelled_pixels_are_no_evidence_and_dilute_if_asked():
 def test_half_precision_features_are_normalised_again():
     features = unit_rows(4, 512, 0)
     lifted = lift(evidence_of([[1.0, 1, 1, 1]], [0, 0, 1, 1], torch.float32), features.half())
-    assert lifted.features.dtype == torch.float32
-    assert (lifted.features.norm(dim=1) - 1).abs().max() < 1e-6
+    assert lifted.features.dtype == torch.float32 and (lifted.features.norm(dim=1) - 1).abs().max() < 1e-6
     assert lifted.scalars.norm.item() == pytest.approx(features.mean(0).norm().item(), rel=1e-3)
 
 

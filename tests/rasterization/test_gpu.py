@@ -44,7 +44,7 @@ def test_gpu_backends_refuse_other_scenes(backend, monkeypatch):
             render(scene, cameras[0], torch.ones(5, 1), backend=backend, dtype=dtype)
     if backend == "gsplat":
         monkeypatch.setattr(gsplat, "check_gpu", lambda *_: None)
-        with pytest.raises(ValueError, match=r'weight_power.* 2;.*backend="auto"'):
+        with pytest.raises(ValueError, match=r"weight_power.* 2;.*backend='auto'"):
             gsplat.check(replace(job(scene), weight_power=2))
 
 
@@ -57,7 +57,7 @@ def test_gpu_backends_draw_what_their_kernels_can(monkeypatch):
         monkeypatch.setattr(backend, "check_gpu", lambda *_: None)
     scene = random_scene(5, dtype=torch.float32)
     gsplat.check(job(scene, eps2d=0.1))
-    with pytest.raises(ValueError, match=r'3D Gaussians only; use backend="auto"'):
+    with pytest.raises(ValueError, match=r"3D Gaussians only; use backend='auto'"):
         gsplat.check(job(replace(scene, primitive="2dgs")))
     triton.check(job(scene, max_alpha=0.99, tile_size=32))
     with pytest.raises(ValueError, match=r"tile_size .*power of two.* 20;"):
@@ -75,7 +75,7 @@ def test_gpu_backends_draw_what_their_kernels_can(monkeypatch):
         if changed is None:
             gsplat.check(wanted)
         else:
-            with pytest.raises(ValueError, match=rf'gsplat {installed} .* {changed} .*"triton"'):
+            with pytest.raises(ValueError, match=rf"gsplat {installed} .* {changed} .*'triton'"):
                 gsplat.check(wanted)
 
 

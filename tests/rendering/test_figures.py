@@ -83,7 +83,7 @@ def test_the_title_says_how_much_and_on_what_evidence() -> None:
     for facts in ("50.0 %", "R 0.50", "3.0 views", "100 %", "R < 0.6"):
         assert facts in figures.FigureHeader.of(finding).summary
     finding.mask = torch.zeros(4, dtype=torch.bool)
-    assert re.fullmatch(r"[^\d]* 0\.5; [^\d]* 0\.90", figures.FigureHeader.of(finding).summary)  # threshold and peak
+    assert re.fullmatch(r"[^\d]* 0\.5, [^\d]* 0\.90\)", figures.FigureHeader.of(finding).summary)  # threshold and peak
     for verdict in ("found", "probably not here", None):  # None: nobody can tell
         finding.verdict = verdict
         assert figures.FigureHeader.of(finding).title.split("   ·   ") == ["x", verdict][: 1 + (verdict is not None)]
