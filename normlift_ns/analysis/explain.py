@@ -149,7 +149,8 @@ class Why:
         """`words`, and a sentence about the share of directions that the vote changed, unless it is 0."""
         if self.changed == 0:
             return self.words
-        return f"{self.words} The vote of neighboring Gaussians changed {self.changed:.0%} of the directions."
+        share = "less than 1%" if self.changed < 0.01 else f"{self.changed:.0%}"
+        return f"{self.words} The vote of neighboring Gaussians changed {share} of the directions."
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields and the words as plain Python types."""
@@ -206,10 +207,7 @@ def explain_selection(
 
 
 def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: Tensor) -> float:
-    """Compare each Gaussian in `rows` with the one at the same position in `origin`.
-
-    Return the share of the pairs whose directions differ.
-    """
+    """Return the share of pairs (rows[i], origin[i]) whose directions differ, from at most `_COMPARED` of the pairs."""
     step = -(-len(rows) // _COMPARED)
     rows, origin = rows[::step], origin[::step]
     other, table = rows != origin, torch.nn.functional.normalize(features.to(rows.device).float(), dim=1)
@@ -435,7 +433,7 @@ class RecordedVotes:
 
     def _no_evidence(self) -> InputError:
         return InputError(
-            f"{self.cache / 'evidence'} no longer has the evidence of the lift, and the run has only directions; "
+            f"{self.cache / 'evidence'} does not have the evidence of the lift, and the run has only directions; "
             f"{REMEDY}. With --storage evidence, a lift stores the evidence in the run."
         )
 

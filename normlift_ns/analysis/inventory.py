@@ -80,8 +80,8 @@ class Inventory:
             ValueError: The inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
-            count = f"{len(self)} object{'s' * (len(self) != 1)}"
-            raise InputError(f"Object {number} does not exist. The inventory has {count}, numbered from 1.")
+            expected = "the inventory has no objects" if len(self) == 0 else f"expected a number in 1..{len(self)}"
+            raise InputError(f"Object {number} does not exist; {expected}")
         return self.instance_id == number
 
 

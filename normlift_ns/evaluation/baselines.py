@@ -277,7 +277,7 @@ def dense_sums(
 ) -> Float[Tensor, "n d"]:
     """Return sum_i A_ij B_i of every Gaussian j over the pixels i of all views, with the compositing weights A_ij.
 
-    The sum is the gradient of gsplat's render with respect to colors. It needs one forward pass per view, and one
+    The sum is the gradient of gsplat's render with respect to colors. Each view needs one forward pass, and one
     backward pass per 32 channels.
 
     Args:

@@ -91,10 +91,7 @@ def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], s
         indices = sample_evenly(len(names), record.options.max_views)
         used = [names[i] for i in indices] if len(indices) == counts.views else None
     if used is None:
-        raise InputError(
-            "the run is from an older version and does not record which images were lifted; lift the scene again with "
-            "ns-normlift"
-        )
+        raise InputError("the run does not record which images were lifted; lift the scene again with ns-normlift")
     if not set(used) <= set(names):
         raise InputError(
             f"the run was lifted from images that {scene.name} no longer has; restore the dataset, give its path with "
@@ -461,7 +458,7 @@ class FreeSpace:
 
     @property
     def depth(self) -> float:
-        """Median depth of all pixels that are not empty, in scene units."""
+        """Median depth of all pixels that are not empty, in scene units; 1 if all are empty."""
         finite = torch.cat([depth[depth.isfinite()] for depth in self.depths])
         return float(finite.median()) if len(finite) > 0 else 1.0
 
@@ -773,8 +770,7 @@ def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str |
         min_reliability: Smallest R of a reliable Gaussian, in 0..1.
         device: Device for the rasterization (default: that of the run).
     Raises:
-        ValueError: If `min_reliability` is not in 0..1.
-        ValueError: For the same reasons as `lifted_names`, or if no image shows a Gaussian.
+        ValueError: If `min_reliability` is not in 0..1 or no image shows a Gaussian, or as in `lifted_names`.
 
     >>> from normlift_ns import coverage, open_run
     >>> run = open_run(config)

@@ -117,7 +117,7 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     for key, count in Counter(key for key, _ in pairs).items():
         if count > 1:
-            raise InputError(f"the key {key!r} occurs twice")
+            raise InputError(f"the key {key!r} occurs more than once")
     return dict(pairs)
 
 

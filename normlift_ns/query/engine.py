@@ -73,7 +73,7 @@ class QueryField(HasManifest, Protocol):
 class Answer:
     """Result of a query with Q prompts. `answer["fox"]` is the result for one prompt; see `Finding`.
 
-    Arrays are torch tensors on the device of the field, or NumPy arrays on the command line.
+    Arrays are like those of the field: torch tensors on its device, or NumPy arrays.
 
     >>> import torch
     >>> from normlift_ns import Evidence, SemanticField, lift
@@ -136,9 +136,7 @@ class Answer:
             KeyError: `text` is not a prompt of the query.
         """
         if text not in self.texts:
-            raise KeyError(
-                f"{text!r} is not a prompt of this query; its prompts are {', '.join(map(repr, self.texts))}"
-            )
+            raise KeyError(f"{text!r} is not a prompt of this query. Prompts: {', '.join(map(repr, self.texts))}")
         return Finding(self, self.texts.index(text))
 
     def numpy(self) -> dict[str, np.ndarray]:

@@ -112,8 +112,8 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
         if vectors.dimension != field.manifest.get("dimension", vectors.dimension):
             raise InputError(
                 f"the vectors in {vectors.file} have {vectors.dimension} dimensions, but the features of the run have "
-                f"{field.manifest['dimension']}. Give a file of text vectors from the encoder of these features with "
-                "--text-embeddings."
+                f"{field.manifest['dimension']}. Give a file of text embeddings from the encoder of these features "
+                "with --text-embeddings."
             )
         return vectors
     try:
@@ -122,7 +122,7 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
         problem = str(error).partition(";")[0]  # the rest suggests another encoder, which a lifted run cannot use
         raise InputError(
             f"The encoder of this run is not available: {problem}. Install or repair its package, or give a file of "
-            "text vectors from that encoder with --text-embeddings."
+            "text embeddings from that encoder with --text-embeddings."
         ) from None
     recorded = _identity(field.manifest.get("features"))
     if kind.texts is not None:
@@ -175,7 +175,7 @@ def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
 def _check_vectors(path: Path, expected: object) -> None:
     """Read a whole file of text embeddings, and raise if its content has changed since the lift."""
     remedy = (
-        "restore the file, give a file of text vectors from the same network with --text-embeddings, or lift again "
+        "restore the file, give a file of text embeddings from the same network with --text-embeddings, or lift again "
         "with: ns-normlift"
     )
     if os.path.lexists(path) and not path.is_file():
@@ -196,8 +196,8 @@ def _options(field: HasManifest) -> SourceOptions:
     vectors = stored["text_vectors"]
     if stored["encoder"] == PRECOMPUTED and vectors is None:
         raise InputError(
-            "This run was lifted from your own features without text embeddings. Give a file of texts and their "
-            "vectors with --text-embeddings, or lift again with text embeddings."
+            "This run was lifted from your own features without text embeddings. Give a file of text "
+            "embeddings with --text-embeddings, or lift again with text embeddings."
         )
     placeholder = {"encoder": "open_clip"} if stored["encoder"] == PRECOMPUTED else {}  # never loaded
     return SourceOptions.stored({**stored, **placeholder})
