@@ -306,7 +306,7 @@ def dense_sums(
 def timing_obstacle(lifted: EvaluatedRun, device: str) -> str | None:
     """Return the reason why the method of Splat Feature Solver cannot be timed, or None if it can be."""
     if not device.startswith("cuda"):
-        return f"gsplat needs a GPU, got --device {device}; use --device cuda"
+        return f"gsplat needs a GPU, but the device is {device}; use --device cuda on a machine with a GPU"
     try:
         check(_job(lifted, device))
     except InputError as error:

@@ -82,7 +82,7 @@ class MaskOptions(CheckedOptions):
     images."""
 
     names: Path | None = None
-    """JSON file with the name of every mask value. None: labels.json next to the mask folder."""
+    """JSON file with the names of mask values. Other values are ignored. None: labels.json next to the mask folder."""
     purity: float = 0.75
     """Minimum share of a Gaussian's weight that must lie in masks of one class for the Gaussian to be scored, in 0..1.
     Larger values score fewer Gaussians."""

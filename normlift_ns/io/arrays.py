@@ -294,5 +294,5 @@ def _check_npy(file: IO[bytes]) -> None:
     start, expected = file.tell(), math.prod(shape) * dtype.itemsize
     found = file.seek(0, os.SEEK_END) - start
     if expected != found:
-        lengths = " x ".join(map(str, shape)) or "1"
-        raise InputError(f"{lengths[:80]} numbers of type {dtype} need {expected:,} bytes, but the file has {found:,}")
+        described = f"an array of shape {str(shape)[:80]} and type {dtype}"
+        raise InputError(f"{described} needs {expected:,} bytes, but {found:,} bytes follow the header of the file")

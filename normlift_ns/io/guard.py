@@ -209,7 +209,7 @@ def file_kind(path: Path) -> str:
 
 
 def suffix_kind(path: Path) -> str | None:
-    """Return the kind of a file by the suffix of its path, in lower case; None for other suffixes."""
+    """Return the kind of a file, which is the suffix of its path in lower case; None for an unknown suffix."""
     return suffix if (suffix := path.suffix.lower()) in {*_KINDS, ".json", ".npz"} else None
 
 

@@ -36,7 +36,7 @@ _WRITTEN = (
     *("field.safetensors", "evidence.safetensors", TEXT_EMBEDDINGS_FILE, "../dataparser_transforms.json"),
     *("../splat.json", "../transforms.json", "../added_photographs.json"),
 )
-"""Files that a lift writes, relative to the field folder."""
+"""Default names of files that a lift writes, relative to the field folder; see `written_files`."""
 SCHEMA_VERSION = 1
 MANIFEST_FILE = "manifest.json"
 LIFT_AGAIN = "lift again with: ns-normlift --load-config ..."
@@ -64,8 +64,8 @@ def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> 
             raise InputError(f"the {kind} must be a string, got {folder!r:.60}")
         if folder.startswith(".") or folder.strip() == "" or {"/", "\\"} & set(folder) or not folder.isprintable():
             raise InputError(
-                f"the {kind} {folder!r} is not a valid folder name; give a printable name that is not blank, "
-                "without slashes or a leading dot, such as 'run'"
+                f"the {kind} {folder!r} is not a valid folder name; give a printable, non-blank name without "
+                "slashes or a leading dot, such as 'run'"
             )
         if len(os.fsencode(folder)) > _MAX_NAME_BYTES:
             raise InputError(

@@ -256,7 +256,7 @@ class Finding:
 
     @property
     def suggested_threshold(self) -> float | None:
-        """Threshold that the histogram suggests for this prompt."""
+        """Threshold that the histogram suggests for this prompt; None if no Gaussian has a direction."""
         return None if self.histogram is None else self.histogram.suggested
 
     @cached_property

@@ -121,9 +121,9 @@ def make_query(
             needs negatives.
         relevancy: Relevancy rule. "auto" is the rule of `default_rule` if `negatives` is None, cosine if `negatives` is
             empty, and lerf otherwise.
-        threshold: Relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests. If
-            None, the default rule of the field has the threshold of `default_rule`. Another rule has its threshold in
-            `RELEVANCY_RULES` if it needs negatives, else "auto", because no threshold suits all encoders.
+        threshold: Relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests.
+            None is the threshold of `default_rule` for the default rule of the field. For other rules, it is that of
+            `RELEVANCY_RULES` if the rule needs negatives, else "auto", because no threshold suits all encoders.
         min_reliability: Minimum reliability R of a selected Gaussian, in 0..1.
         refined: Use refined features.
     Raises:
