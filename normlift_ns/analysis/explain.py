@@ -37,7 +37,7 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import restore_source
-from normlift_ns.encoders.cache import REMEDY, cached
+from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.errors import InputError
 from normlift_ns.options import GSPLAT_VERSIONS, UnlabeledMode
@@ -331,10 +331,7 @@ class RecordedVotes:
         """
         names = self.field.manifest.get("views_lifted")
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise InputError(
-                "the run does not list its lifted images, because it is damaged or from an older version; lift again "
-                "with: ns-normlift"
-            )
+            raise InputError("the run does not record the names of its lifted images; lift again with: ns-normlift")
         missing = [name for name in names if name not in set(self.scene.train.names)]
         if len(missing) > 0:
             raise InputError(
@@ -433,8 +430,9 @@ class RecordedVotes:
 
     def _no_evidence(self) -> InputError:
         return InputError(
-            f"{self.cache / 'evidence'} does not have the evidence of the lift, and the run has only directions; "
-            f"{REMEDY}. With --storage evidence, a lift stores the evidence in the run."
+            f"{self.cache / 'evidence'} does not have the evidence of the lift, and the run has only directions. Copy "
+            "this folder from where the scene was lifted, or lift again with the same options: ns-normlift. With "
+            "--storage evidence, a lift stores the evidence in the run."
         )
 
     def _observe(self, views: Sequence[int]) -> tuple[evidence_collection.ViewBatch, list[Tensor]]:
@@ -482,6 +480,7 @@ class RecordedVotes:
         value = options.get(name, default) if isinstance(options, Mapping) else default
         if not isinstance(value, (int, float) if kind is float else kind):
             raise InputError(
-                f"the run's manifest is damaged: its option {name} is {value!r:.40}. Lift the scene again."
+                f"the run's manifest is damaged: its option {name} is {value!r:.40}, expected a value of type "
+                f"{kind.__name__}. Lift the scene again."
             )
         return value

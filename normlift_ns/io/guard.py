@@ -157,13 +157,13 @@ def _input_files() -> dict[tuple[int, int], str]:
     return found
 
 
-def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=True") -> None:
+def refuse_other_kinds(path: Path, kind: str | None, flags: str = "") -> None:
     """Raise if an output would replace anything except an empty file or a regular file of its own kind.
 
     Args:
         path: Path of the output. If it does not exist, the function returns without a check.
         kind: Kind of the output, as `file_kind` returns it; None if it is not known yet.
-        flags: Options or arguments that named the output or allowed it to be overwritten, for the error message.
+        flags: Flags that named the output, for the error message; empty if there are none.
     Raises:
         ValueError: `path` is a folder, a pipe, a device or a broken link, cannot be read, or is of a different kind.
     """
@@ -172,14 +172,13 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=Tru
     try:
         found = file_kind(path)
     except (OSError, InputError):
-        raise InputError(
-            f"{path}, given with {flags}, is not a regular file, or cannot be read; give another name"
-        ) from None
+        output = f"{path}, given with {flags}," if flags else f"{path}"
+        raise InputError(f"{output} is not a regular file, or cannot be read; give another name") from None
     if found != "" and kind is not None and kind != found:
         old, new = (f"a {name} file" if name.startswith(".") else name or "an empty file" for name in (found, kind))
         raise InputError(
             f"The content of {path} is {old}, but the output is {new}, and only a file of the same kind can be "
-            "overwritten; give another name, or delete the file"
+            "replaced; give another name, or delete the file"
         )
 
 
