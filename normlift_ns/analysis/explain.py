@@ -40,7 +40,7 @@ from normlift_ns.encoders.build import restore_source
 from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.errors import InputError
-from normlift_ns.options import GSPLAT_VERSIONS, UnlabeledMode
+from normlift_ns.options import GSPLAT_VERSIONS, UnlabeledMode, option_name, option_setting
 from normlift_ns.rasterization.settings import RasterSettings
 
 _UNLISTED_SHARE = 0.1
@@ -336,7 +336,7 @@ class RecordedVotes:
         if len(missing) > 0:
             raise InputError(
                 f"the dataset no longer has {len(missing)} of {len(names)} images of the lift (first: {missing[0]}). "
-                "Restore the images, give the path of the dataset with --data, or lift again with: ns-normlift"
+                f"Restore the images, set {option_name('data')} to the dataset path, or lift again with: ns-normlift"
             )
         store = self.field.store
         if isinstance(store, StoredEvidence) and store.evidence.num_views != len(names):
@@ -432,7 +432,7 @@ class RecordedVotes:
         return InputError(
             f"{self.cache / 'evidence'} does not have the evidence of the lift, and the run has only directions. Copy "
             "this folder from where the scene was lifted, or lift again with the same options: ns-normlift. With "
-            "--storage evidence, a lift stores the evidence in the run."
+            f"{option_setting('storage', 'evidence')}, a lift stores the evidence in the run."
         )
 
     def _observe(self, views: Sequence[int]) -> tuple[evidence_collection.ViewBatch, list[Tensor]]:

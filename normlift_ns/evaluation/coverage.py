@@ -36,7 +36,7 @@ from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_files
 from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.options import RasterizeMode, check_number, check_path
+from normlift_ns.options import RasterizeMode, check_number, check_path, option_name
 from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidence, render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 
@@ -94,8 +94,8 @@ def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], s
         raise InputError("the run does not record which images were lifted; lift the scene again with ns-normlift")
     if not set(used) <= set(names):
         raise InputError(
-            f"the run was lifted from images that {scene.name} no longer has; restore the dataset, give its path with "
-            "--data, or lift the scene again"
+            f"the run was lifted from images that {scene.name} no longer has; restore the dataset, set "
+            f"{option_name('data')} to its path, or lift the scene again"
         )
     return set(used), set(record.views_without_features)
 
