@@ -275,7 +275,7 @@ def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
 def _targets(
     borders: _Borders, affinity: Float64[np.ndarray, " e"], size: Float64[np.ndarray, " n"], chosen: np.ndarray
 ) -> Int64[np.ndarray, " n"]:
-    """Return the part that each part joins: the larger part with the largest affinity, or itself.
+    """Return the part that each part joins: the part with the largest affinity if that part is larger, or else itself.
 
     Only the borders with the indices `chosen` count. Ties go to the larger part, then to the part with the smaller
     index. Of two equally large parts, the part with the smaller index counts as larger.

@@ -172,7 +172,7 @@ class GaussianEvidence(NamedTuple):
 
 
 def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """Return a mask that omits the smallest Gaussians, which together have `_HIDDEN_SHARE` of the surface.
+    """Return a mask that omits the smallest Gaussians, which together have at most `_HIDDEN_SHARE` of the surface.
 
     >>> visible(torch.tensor([0.5, 0.001, 0.5, 0.0])).tolist()
     [True, False, True, False]

@@ -272,7 +272,7 @@ def _key() -> bytes:
 # Atomic file writes, which replace existing files only if the caller allows it.
 #
 # New files are written into a temporary folder next to their destination, flushed to the disk and renamed. A process
-# holds the lock of its temporary folder while it writes. Later processes delete temporary folders without a lock.
+# holds the lock of its temporary folder while it writes. Later processes delete unlocked temporary folders.
 
 
 _TEMPORARY_PREFIX = ".normlift-"
