@@ -197,7 +197,7 @@ def _options(field: HasManifest) -> SourceOptions:
     if stored["encoder"] == PRECOMPUTED and vectors is None:
         raise InputError(
             "This run was lifted from your own features without text embeddings. Set "
-            f"{option_name('text_embeddings')} to a file of text embeddings, or lift again with text embeddings."
+            f"{option_name('text_embeddings')} to a file of text embeddings, or lift again with the argument texts."
         )
     placeholder = {"encoder": "open_clip"} if stored["encoder"] == PRECOMPUTED else {}  # never loaded
     return SourceOptions.stored({**stored, **placeholder})
