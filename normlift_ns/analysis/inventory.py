@@ -225,7 +225,7 @@ def view_regions(evidence: Evidence) -> Iterator[ViewRegions]:
 def _neighbor_borders(
     views: Iterable[ViewRegions], features: Float[Tensor, "s d"], means: Float[Tensor, "n 3"], spread: float
 ) -> _Borders:
-    """Return the borders between every Gaussian and its nearest neighbors; each Gaussian is a part of its own."""
+    """Return the borders between every Gaussian and its nearest neighbors; each Gaussian is a separate part."""
     neighbors = nearest_neighbors(means, _NEIGHBORS).index.long()
     here = torch.arange(len(means))[:, None].expand_as(neighbors)
     low, high = torch.minimum(here, neighbors), torch.maximum(here, neighbors)
@@ -294,7 +294,7 @@ def _targets(
 
 
 def as_instances(instance_id: Int32[Tensor, " n"], names: tuple[str, ...]) -> Instances:
-    """Return the objects as instances, each of its own class, for the catalog and exports."""
+    """Return the objects as instances, each with its own class, for the catalog and exports."""
     return Instances(names, instance_id, instance_id, tuple(range(1, len(names) + 1)))
 
 

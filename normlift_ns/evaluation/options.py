@@ -111,7 +111,7 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
         document = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_reject_constant)
         return msgspec.convert(document, kind)
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
-        raise InputError(f"{type(error).__name__}: {error}") from None
+        raise InputError(str(error)) from None
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -256,11 +256,10 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
         text = read_text(path)
         facts = json.loads(text)
         if not isinstance(facts, dict):
-            raise InputError(f"it contains a {type(facts).__name__}, expected a JSON object")
+            raise InputError(f"its content has type {type(facts).__name__}, expected a JSON object")
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
-            f"the semantic field in {folder} is damaged or cannot be read ({path}: {type(error).__name__}: {error}); "
-            f"{LIFT_AGAIN}"
+            f"the semantic field in {folder} is damaged or cannot be read ({path}: {error}); {LIFT_AGAIN}"
         ) from error
     if facts.get("schema_version") != SCHEMA_VERSION or isinstance(facts["schema_version"], bool):
         version = repr(facts.get("schema_version"))[:50]
