@@ -21,7 +21,16 @@ from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.io.run_dir import MANIFEST_FILE, read_manifest
-from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, check_bool, check_number, renamed, short_repr
+from normlift_ns.options import (
+    CANONICAL_NEGATIVES,
+    RelevancyRule,
+    check_bool,
+    check_number,
+    option_name,
+    option_setting,
+    renamed,
+    short_repr,
+)
 from normlift_ns.query.text_encoder import DefaultRule, HasManifest, default_rule, encoder_digest
 
 _PROMPT = re.compile(r'\s*(?:"([^"]*)"|([^,;\n]*))\s*(?:[,;\n]|$)')
@@ -171,7 +180,8 @@ def _resolve_negatives(
     if negatives is None:
         return tuple(default.negatives or needed)
     if needed and len(negatives) == 0:
-        raise InputError(f"relevancy {relevancy} needs negatives, but negatives is empty. Give at least one negative.")
+        rule, names = option_setting("relevancy", relevancy), option_name("negatives")
+        raise InputError(f"{rule} needs at least one entry in {names}, got none")
     return tuple(negatives)
 
 
