@@ -97,7 +97,7 @@ def test_images_that_share_a_label_map_or_exported_files_are_refused(tmp_path: P
 def test_labels_of_nothing_are_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "0000.npy", FULL)
     (tmp_path / "labels.json").write_text('{"2": "a"}')
-    with pytest.raises(nl.InputError, match=r"no Gaussian lies in a mask of .*labels\.json"):
+    with pytest.raises(nl.InputError, match=r"no Gaussian can be scored .*labels\.json"):
         mask_truth(scene("0000.png"), tmp_path, MaskOptions(names=tmp_path / "labels.json"))
     info = {"width": WIDTH, "height": HEIGHT}
     (tmp_path / "0000.json").write_text(json.dumps({"info": info, "objects": []}))

@@ -37,10 +37,10 @@ from normlift_ns.core.scene import Scene
 from normlift_ns.core.sparse import SparseRows, row_offsets
 from normlift_ns.encoders.base import FeatureSource
 from normlift_ns.encoders.build import restore_source
-from normlift_ns.encoders.cache import REMEDY, cached
+from normlift_ns.encoders.cache import cached
 from normlift_ns.encoders.color import ColorEncoder
 from normlift_ns.errors import InputError
-from normlift_ns.options import GSPLAT_VERSIONS, UnlabeledMode
+from normlift_ns.options import GSPLAT_VERSIONS, UnlabeledMode, option_name, option_setting
 from normlift_ns.rasterization.settings import RasterSettings
 
 _UNLISTED_SHARE = 0.1
@@ -149,7 +149,8 @@ class Why:
         """`words`, and a sentence about the share of directions that the vote changed, unless it is 0."""
         if self.changed == 0:
             return self.words
-        return f"{self.words} The vote of neighboring Gaussians changed {self.changed:.0%} of the directions."
+        share = "less than 1%" if self.changed < 0.01 else f"{self.changed:.0%}"
+        return f"{self.words} The vote of neighboring Gaussians changed {share} of the directions."
 
     def to_json(self) -> dict[str, Any]:
         """Return all fields and the words as plain Python types."""
@@ -206,10 +207,7 @@ def explain_selection(
 
 
 def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: Tensor) -> float:
-    """Compare each Gaussian in `rows` with the one at the same position in `origin`.
-
-    Return the share of the pairs whose directions differ.
-    """
+    """Return the share of pairs (rows[i], origin[i]) whose directions differ, from at most `_COMPARED` of the pairs."""
     step = -(-len(rows) // _COMPARED)
     rows, origin = rows[::step], origin[::step]
     other, table = rows != origin, torch.nn.functional.normalize(features.to(rows.device).float(), dim=1)
@@ -333,15 +331,12 @@ class RecordedVotes:
         """
         names = self.field.manifest.get("views_lifted")
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise InputError(
-                "the run does not list its lifted images, because it is damaged or from an older version; lift again "
-                "with: ns-normlift"
-            )
+            raise InputError("the run does not record the names of its lifted images; lift again with: ns-normlift")
         missing = [name for name in names if name not in set(self.scene.train.names)]
         if len(missing) > 0:
             raise InputError(
                 f"the dataset no longer has {len(missing)} of {len(names)} images of the lift (first: {missing[0]}). "
-                "Restore the images, give the path of the dataset with --data, or lift again with: ns-normlift"
+                f"Restore the images, set {option_name('data')} to the dataset path, or lift again with: ns-normlift"
             )
         store = self.field.store
         if isinstance(store, StoredEvidence) and store.evidence.num_views != len(names):
@@ -435,8 +430,9 @@ class RecordedVotes:
 
     def _no_evidence(self) -> InputError:
         return InputError(
-            f"{self.cache / 'evidence'} no longer has the evidence of the lift, and the run has only directions; "
-            f"{REMEDY}. With --storage evidence, a lift stores the evidence in the run."
+            f"{self.cache / 'evidence'} does not have the evidence of the lift, and the run has only directions. Copy "
+            "this folder from where the scene was lifted, or lift again with the same options: ns-normlift. With "
+            f"{option_setting('storage', 'evidence')}, a lift stores the evidence in the run."
         )
 
     def _observe(self, views: Sequence[int]) -> tuple[evidence_collection.ViewBatch, list[Tensor]]:
@@ -484,6 +480,7 @@ class RecordedVotes:
         value = options.get(name, default) if isinstance(options, Mapping) else default
         if not isinstance(value, (int, float) if kind is float else kind):
             raise InputError(
-                f"the run's manifest is damaged: its option {name} is {value!r:.40}. Lift the scene again."
+                f"the run's manifest is damaged: its option {name} is {value!r:.40}, expected a value of type "
+                f"{kind.__name__}. Lift the scene again."
             )
         return value

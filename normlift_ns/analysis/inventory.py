@@ -80,8 +80,8 @@ class Inventory:
             ValueError: The inventory has no object with this number.
         """
         if not 1 <= number <= len(self):
-            count = f"{len(self)} object{'s' * (len(self) != 1)}"
-            raise InputError(f"Object {number} does not exist. The inventory has {count}, numbered from 1.")
+            expected = "the inventory has no objects" if len(self) == 0 else f"expected a number in 1..{len(self)}"
+            raise InputError(f"Object {number} does not exist; {expected}")
         return self.instance_id == number
 
 
@@ -225,7 +225,7 @@ def view_regions(evidence: Evidence) -> Iterator[ViewRegions]:
 def _neighbor_borders(
     views: Iterable[ViewRegions], features: Float[Tensor, "s d"], means: Float[Tensor, "n 3"], spread: float
 ) -> _Borders:
-    """Return the borders between every Gaussian and its nearest neighbors; each Gaussian is a part of its own."""
+    """Return the borders between every Gaussian and its nearest neighbors; each Gaussian is a separate part."""
     neighbors = nearest_neighbors(means, _NEIGHBORS).index.long()
     here = torch.arange(len(means))[:, None].expand_as(neighbors)
     low, high = torch.minimum(here, neighbors), torch.maximum(here, neighbors)
@@ -275,7 +275,7 @@ def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
 def _targets(
     borders: _Borders, affinity: Float64[np.ndarray, " e"], size: Float64[np.ndarray, " n"], chosen: np.ndarray
 ) -> Int64[np.ndarray, " n"]:
-    """Return the part that each part joins: the larger part with the largest affinity, or itself.
+    """Return the part that each part joins: the part with the largest affinity if that part is larger, or else itself.
 
     Only the borders with the indices `chosen` count. Ties go to the larger part, then to the part with the smaller
     index. Of two equally large parts, the part with the smaller index counts as larger.
@@ -294,7 +294,7 @@ def _targets(
 
 
 def as_instances(instance_id: Int32[Tensor, " n"], names: tuple[str, ...]) -> Instances:
-    """Return the objects as instances, each of its own class, for the catalog and exports."""
+    """Return the objects as instances, each with its own class, for the catalog and exports."""
     return Instances(names, instance_id, instance_id, tuple(range(1, len(names) + 1)))
 
 

@@ -80,7 +80,7 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
     if len(points) == 0 or not np.isfinite(points).all():
         finite = int(np.isfinite(points).all(axis=1).sum())
         raise InputError(
-            f"a box needs at least one point, and only finite points; got {len(points)} points, {finite} of them finite"
+            f"a box needs at least one point, and all points must be finite; points: {len(points)}, finite: {finite}"
         )
     axes = _axes(points[_central(points)])
     low, high = np.quantile(points @ axes.T, BOX_QUANTILES, axis=0)

@@ -277,7 +277,7 @@ def dense_sums(
 ) -> Float[Tensor, "n d"]:
     """Return sum_i A_ij B_i of every Gaussian j over the pixels i of all views, with the compositing weights A_ij.
 
-    The sum is the gradient of gsplat's render with respect to colors. It needs one forward pass per view, and one
+    The sum is the gradient of gsplat's render with respect to colors. Each view needs one forward pass, and one
     backward pass per 32 channels.
 
     Args:
@@ -306,7 +306,7 @@ def dense_sums(
 def timing_obstacle(lifted: EvaluatedRun, device: str) -> str | None:
     """Return the reason why the method of Splat Feature Solver cannot be timed, or None if it can be."""
     if not device.startswith("cuda"):
-        return f"gsplat needs a GPU, got --device {device}; use --device cuda"
+        return f"gsplat needs a GPU, but the device is {device}; use --device cuda on a machine with a GPU"
     try:
         check(_job(lifted, device))
     except InputError as error:

@@ -36,7 +36,7 @@ from normlift_ns.evidence_collection import sample_evenly
 from normlift_ns.io.atomic import atomic_files
 from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.lifted_run import LiftedRun
-from normlift_ns.options import RasterizeMode, check_number, check_path
+from normlift_ns.options import RasterizeMode, check_number, check_path, option_name
 from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidence, render, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 
@@ -91,14 +91,11 @@ def lifted_names(scene: Scene, manifest: Mapping[str, Any]) -> tuple[set[str], s
         indices = sample_evenly(len(names), record.options.max_views)
         used = [names[i] for i in indices] if len(indices) == counts.views else None
     if used is None:
-        raise InputError(
-            "the run is from an older version and does not record which images were lifted; lift the scene again with "
-            "ns-normlift"
-        )
+        raise InputError("the run does not record which images were lifted; lift the scene again with ns-normlift")
     if not set(used) <= set(names):
         raise InputError(
-            f"the run was lifted from images that {scene.name} no longer has; restore the dataset, give its path with "
-            "--data, or lift the scene again"
+            f"the run was lifted from images that {scene.name} no longer has; restore the dataset, set "
+            f"{option_name('data')} to its path, or lift the scene again"
         )
     return set(used), set(record.views_without_features)
 
@@ -175,7 +172,7 @@ class GaussianEvidence(NamedTuple):
 
 
 def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """Return a mask that omits the smallest Gaussians, which together have `_HIDDEN_SHARE` of the surface.
+    """Return a mask that omits the smallest Gaussians, which together have at most `_HIDDEN_SHARE` of the surface.
 
     >>> visible(torch.tensor([0.5, 0.001, 0.5, 0.0])).tolist()
     [True, False, True, False]
@@ -461,7 +458,7 @@ class FreeSpace:
 
     @property
     def depth(self) -> float:
-        """Median depth of all pixels that are not empty, in scene units."""
+        """Median depth of all pixels that are not empty, in scene units; 1 if all are empty."""
         finite = torch.cat([depth[depth.isfinite()] for depth in self.depths])
         return float(finite.median()) if len(finite) > 0 else 1.0
 
@@ -773,8 +770,7 @@ def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str |
         min_reliability: Smallest R of a reliable Gaussian, in 0..1.
         device: Device for the rasterization (default: that of the run).
     Raises:
-        ValueError: If `min_reliability` is not in 0..1.
-        ValueError: For the same reasons as `lifted_names`, or if no image shows a Gaussian.
+        ValueError: If `min_reliability` is not in 0..1 or no image shows a Gaussian, or as in `lifted_names`.
 
     >>> from normlift_ns import coverage, open_run
     >>> run = open_run(config)

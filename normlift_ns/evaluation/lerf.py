@@ -126,10 +126,11 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
 def _points(segmentation: Sequence[_Point], width: int, height: int) -> np.ndarray:
     """Return the points of a polygon. Raise InputError if a point is farther from the image than the image size."""
     points = np.array(segmentation, dtype=float)
-    if np.abs(points / (width, height) - 0.5).max() > 1.5:
+    distance = np.abs(points / (width, height) - 0.5)
+    if distance.max() > 1.5:
         raise InputError(
             f"a segmentation or bbox in an image of {width} x {height} pixels has a coordinate of "
-            f"{np.abs(points).max():g}"
+            f"{points.flat[distance.argmax()]:g}"
         )
     return points
 
@@ -197,10 +198,10 @@ def prompt_mask(
     """Return the mask of a prompt.
 
     Args:
-        masking: "background" selects scores that exceed every background word by the margin. "auto" selects scores
-            of at least `histogram_threshold`. "langsplat" and "langsplat_composited" scale the relevancy to 0..1 over
-            the image. They select a pixel if most pixels around it exceed 0.7, which LangSplat writes as
-            2 x - 1 > 0.4.
+        masking: "background" selects scores that exceed those of all background words by more than the margin.
+            "auto" selects scores of at least `histogram_threshold`. "langsplat" and "langsplat_composited" scale the
+            relevancy to 0..1 over the image. They select a pixel if most pixels around it exceed 0.7, which LangSplat
+            writes as 2 x - 1 > 0.4.
         margin: Lead over the background words, in cosine.
         instances: Number of true instances.
     """
@@ -346,7 +347,8 @@ def run_lerf(runs: Iterable[EvaluatedRun], labels: Sequence[Path], options: Lerf
                 for row in frame_rows(scores, options.masking, margin=options.margin, clean=options.clean)
             ]
     if len(rows) == 0:
-        raise InputError(f"the label files in {', '.join(map(str, labels))} have no objects; annotate at least one")
+        folders = ", ".join(map(str, labels))
+        raise InputError(f"the label files that match images have no objects ({folders}); annotate at least one object")
     settings = {**asdict(options), "labels_without_image": missing}
     return summarize_lerf(rows, options.average, settings)
 

@@ -82,7 +82,7 @@ class MaskOptions(CheckedOptions):
     images."""
 
     names: Path | None = None
-    """JSON file with the name of every mask value. None: labels.json next to the mask folder."""
+    """JSON file with the names of mask values. Other values are ignored. None: labels.json next to the mask folder."""
     purity: float = 0.75
     """Minimum share of a Gaussian's weight that must lie in masks of one class for the Gaussian to be scored, in 0..1.
     Larger values score fewer Gaussians."""
@@ -111,13 +111,13 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
         document = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_reject_constant)
         return msgspec.convert(document, kind)
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
-        raise InputError(f"{type(error).__name__}: {error}") from None
+        raise InputError(str(error)) from None
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     for key, count in Counter(key for key, _ in pairs).items():
         if count > 1:
-            raise InputError(f"the key {key!r} occurs twice")
+            raise InputError(f"the key {key!r} occurs more than once")
     return dict(pairs)
 
 

@@ -275,8 +275,8 @@ def mask_truth(
     truth = gaussian_truth(evidence, count, purity=options.purity, min_weight=options.min_weight)
     if not bool((truth >= 0).any()):
         raise InputError(
-            f"no Gaussian lies in a mask of {folder}; check that the mask values are those in "
-            f"{options.names or folder.parent / 'labels.json'}, and check --purity and --min-weight"
+            f"no Gaussian can be scored with the masks in {folder}; check that the mask values are those in "
+            f"{options.names or folder.parent / 'labels.json'}, or reduce --purity or --min-weight"
         )
     facts = {**asdict(options), "names": list(names.classes), "held_out_views": len(scene.held_out)}
     return MaskTruth(names.classes, truth, list(classes(scene.held_out)), facts)

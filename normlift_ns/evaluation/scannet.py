@@ -64,8 +64,8 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(
-            f"the label file {path} does not exist; expected ScanNet's *_vh_clean_2.labels.ply, which you can download "
-            "after registration, under its license"
+            f"the label file {path} does not exist or is not a file; expected ScanNet's *_vh_clean_2.labels.ply, which "
+            "you can download after registration, under its license"
         )
     try:
         check_ply_header(path)
@@ -89,8 +89,8 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
     unknown = (labels > _LAST_ID) | (labels < -1)
     if unknown.any():
         warnings.warn(
-            f"{path} has labels that are not NYU40 ids, such as {labels[unknown][0]} ({int(unknown.sum()):,} of "
-            f"{len(labels):,} labels); they are treated as unlabeled",
+            f"{path} has labels that are not NYU40 ids, such as {labels[unknown][0]}. Vertices with such labels "
+            f"({int(unknown.sum()):,} of {len(labels):,}) are treated as unlabeled.",
             stacklevel=2,
         )
     return torch.from_numpy(np.where(unknown, 0, labels))

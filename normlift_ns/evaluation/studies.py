@@ -340,7 +340,10 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
 
 
 def _correct_predictions(scenes: Sequence[SceneSignals]) -> tuple[Bool[Tensor, " n"], dict[str, Bool[Tensor, " n"]]]:
-    """Return a mask of the Gaussians with ground truth, and a mask of correct ones for each kind of prediction."""
+    """Return a mask of the Gaussians with ground truth, and a mask of the correct predictions of each kind.
+
+    Both are empty if a scene has no ground truth.
+    """
     truths = [scene.truth for scene in scenes if scene.truth is not None]
     if len(truths) < len(scenes):
         return torch.zeros(0, dtype=torch.bool), {}
@@ -482,7 +485,7 @@ def study_ablation(
     """Evaluate the protocol with every variant without consensus, and with `CONSENSUS_VARIANTS` after a consensus.
 
     Args:
-        warn: Callback with the reason if variants are skipped, because the features of a run are not available.
+        warn: Function that receives the reason if variants are skipped because features of a run are not available.
     """
     rows: list[Row] = []
     for on, names in ((False, {name: name for name in get_args(Variant)}), (True, CONSENSUS_VARIANTS)):
@@ -561,7 +564,7 @@ def study_timing(
     On a GPU, also time the method of Splat Feature Solver and that of this package on some views of each run.
 
     Args:
-        tell: Callback with the reason if the method of Splat Feature Solver is skipped.
+        tell: Function that receives the reason if the method of Splat Feature Solver is skipped.
     """
     rows = []
     for lifted in runs:

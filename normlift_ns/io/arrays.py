@@ -141,7 +141,7 @@ def read_metadata(path: Path) -> dict[str, str]:
     except FileNotFoundError:
         raise
     except (SafetensorError, OSError, ValueError) as error:
-        raise InputError(f"{path} is damaged or not a safetensors file ({error})") from error
+        raise InputError(f"{path} is damaged, cannot be read, or is not a safetensors file ({error})") from error
 
 
 def load_arrays(
@@ -179,7 +179,9 @@ def load_arrays(
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing; {remedy}") from None
     except (SafetensorError, OSError, KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
-        raise InputError(f"{path} is damaged or not a safetensors file ({error}); {remedy}") from error
+        raise InputError(
+            f"{path} is damaged, cannot be read, or is not a safetensors file ({error}); {remedy}"
+        ) from error
     if actual != expected:
         problem = f"expected {expected}" if expected else "but its metadata has none"
         raise InputError(f"{path} is damaged: its content has digest {actual}, {problem}; {remedy}")
@@ -203,7 +205,7 @@ def check_array(
         raise InputError(f"{name} is {array.dtype} {array.shape}, expected {dtype} {tuple(shape)}")
     least, most = _extremes(array) if array.size > 0 else (low, low)
     if not low <= least <= most <= high:
-        raise InputError(f"{name} has values in {least}..{most}, expected {low:g}..{high:g}")
+        raise InputError(f"{name} has values in {least}..{most}, expected {low:.9g}..{high:.9g}")
 
 
 def _extremes(array: np.ndarray) -> tuple[float, float]:
@@ -263,7 +265,7 @@ def read_npy(path: Path, description: str) -> np.ndarray:
         return np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{description} {path} is damaged or not an NPY file ({error}); write it again with numpy.save"
+            f"{description} {path} cannot be read as an NPY file of numbers ({error}); write it again with numpy.save"
         ) from None
 
 
@@ -292,5 +294,5 @@ def _check_npy(file: IO[bytes]) -> None:
     start, expected = file.tell(), math.prod(shape) * dtype.itemsize
     found = file.seek(0, os.SEEK_END) - start
     if expected != found:
-        lengths = " x ".join(map(str, shape)) or "1"
-        raise InputError(f"{lengths[:80]} numbers of type {dtype} need {expected:,} bytes, but the file has {found:,}")
+        described = f"an array of shape {str(shape)[:80]} and type {dtype}"
+        raise InputError(f"{described} needs {expected:,} bytes, but {found:,} bytes follow the header of the file")

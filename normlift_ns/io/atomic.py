@@ -208,8 +208,9 @@ def complete_journal(temporary: Path) -> bool:
     steps = _read(journal)
     if steps is None:
         warnings.warn(
-            f"{temporary} contains new files for {temporary.parent} from an interrupted command of another user or "
-            "machine. They stay there. Run that command again as that user, or delete the folder.",
+            f"{temporary} contains new files of an interrupted command. They are not moved to {temporary.parent}, "
+            "because another user or machine may have written them. Run the command again as the same user on the same "
+            f"machine, or delete {temporary}.",
             stacklevel=2,
         )
         return False
@@ -271,7 +272,7 @@ def _key() -> bytes:
 # Atomic file writes, which replace existing files only if the caller allows it.
 #
 # New files are written into a temporary folder next to their destination, flushed to the disk and renamed. A process
-# holds the lock of its temporary folder while it writes. Later processes delete temporary folders without a lock.
+# holds the lock of its temporary folder while it writes. Later processes delete unlocked temporary folders.
 
 
 _TEMPORARY_PREFIX = ".normlift-"
@@ -499,8 +500,8 @@ def _draft_folder(*paths: Path) -> Iterator[Path]:
         if not isinstance(error, NotWrittenError):
             names = ", ".join(map(str, paths))
             blocked = isinstance(error, IsADirectoryError | NotADirectoryError | FileExistsError)
-            remedy = "delete the file or folder at this path" if blocked else "free disk space or choose another folder"
-            reason = f"{names} cannot be written ({reason}); {remedy}, then run the command again"
+            remedy = "delete the file or folder in the way" if blocked else "free disk space or choose another folder"
+            reason = f"{names} cannot be written ({reason}); {remedy}, then try again"
         raise NotWrittenError(reason) from error
     finally:
         for place in new_folders:

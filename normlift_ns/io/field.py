@@ -1,4 +1,4 @@
-"""Reader for the files of a semantic field, which checks their digests, shapes, index ranges and finite values.
+"""Reader for the files of a semantic field. It checks digests, shapes and ranges of values.
 
 This module does not need torch.
 """

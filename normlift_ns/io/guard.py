@@ -120,24 +120,24 @@ def refuse_inputs(paths: Iterable[Path], *, instead: str = "path") -> None:
     for path in paths:
         owner = _owner_of(os.path.realpath(path), owners, inputs)
         if owner is not None:
-            raise InputError(f"{path} is part of {owner}, so it cannot be an output; give another {instead}")
+            raise InputError(f"{path} is {owner}, so it cannot be an output; give another {instead}")
 
 
 def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callable[[], Mapping[Any, str]]) -> str | None:
-    """Return a description of the input, run, data set or cache that contains a path; None if it may be written.
+    """Return a description of a path that is an input or part of an input, run, data set or cache; None for others.
 
     Links in the path must already be resolved.
     """
     exists, folder = os.path.exists(path), os.path.dirname(path)
     for kind, parent, names in owners(folder):
         if (exists or kind == "run") and names.fullmatch(Path(path).relative_to(parent).parts[0]):
-            return f"the {kind} {parent}"
+            return f"part of the {kind} {parent}"
     parts = Path(folder).parts
     if (exists and ".cache" in parts) or ("normlift", ".cache") in pairwise(parts):
-        return f"the cache {folder}"
+        return f"part of the cache {folder}"
     statuses = map(os.stat, (path, *Path(path).parents) if exists else ())
     name = next(filter(None, (inputs().get((status.st_dev, status.st_ino)) for status in statuses)), None)
-    return None if name is None else f"the input {name}"
+    return name and (f"part of the input folder {name}" if os.path.isdir(name) else f"the input file {name}")
 
 
 def _owners(folder: str) -> Iterable[tuple[str, str, re.Pattern[str]]]:
@@ -157,13 +157,13 @@ def _input_files() -> dict[tuple[int, int], str]:
     return found
 
 
-def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=True") -> None:
+def refuse_other_kinds(path: Path, kind: str | None, flags: str = "") -> None:
     """Raise if an output would replace anything except an empty file or a regular file of its own kind.
 
     Args:
         path: Path of the output. If it does not exist, the function returns without a check.
         kind: Kind of the output, as `file_kind` returns it; None if it is not known yet.
-        flags: Options or arguments that named the output or allowed it to be overwritten, for the error message.
+        flags: Flags that named the output, for the error message; empty if there are none.
     Raises:
         ValueError: `path` is a folder, a pipe, a device or a broken link, cannot be read, or is of a different kind.
     """
@@ -172,14 +172,13 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "overwrite=Tru
     try:
         found = file_kind(path)
     except (OSError, InputError):
-        raise InputError(
-            f"{path}, given with {flags}, is not a regular file, or cannot be read; give another name"
-        ) from None
+        output = f"{path}, given with {flags}," if flags else f"{path}"
+        raise InputError(f"{output} is not a regular file, or cannot be read; give another name") from None
     if found != "" and kind is not None and kind != found:
-        content = f"a {found} file" if found.startswith(".") else found
+        old, new = (f"a {name} file" if name.startswith(".") else name or "an empty file" for name in (found, kind))
         raise InputError(
-            f"The content of {path} is {content}, but the output is a {kind} file, and only a file of the same kind "
-            "can be overwritten; give another name, or delete the file"
+            f"The content of {path} is {old}, but the output is {new}, and only a file of the same kind can be "
+            "replaced; give another name, or delete the file"
         )
 
 
@@ -209,7 +208,7 @@ def file_kind(path: Path) -> str:
 
 
 def suffix_kind(path: Path) -> str | None:
-    """Return the kind of a file by the suffix of its path, in lower case; None for other suffixes."""
+    """Return the kind of a file, which is the suffix of its path in lower case; None for an unknown suffix."""
     return suffix if (suffix := path.suffix.lower()) in {*_KINDS, ".json", ".npz"} else None
 
 

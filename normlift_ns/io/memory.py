@@ -77,9 +77,13 @@ def check_free_memory(needed: int, what: str, needed_by_limit: Mapping[str, int]
         if free < least:
             advice = "Close other programs" if name == "the machine" else "Raise this limit"
             raise MemoryError(
-                f"{what} needs at least {least / 2**30:.2f} GiB of memory, but {name} leaves "
-                f"{max(0, free) / 2**30:.2f} GiB. {advice}, or use a smaller scene."
+                f"{what} needs at least {_size(least)} of memory, but {name} leaves {_size(max(0, free))}. {advice}, "
+                "or use a smaller scene."
             )
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**30:.2f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
 
 
 def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = True) -> None:
@@ -95,7 +99,7 @@ def refuse_small_memory(gaussians: int = 0, pixels: int = 0, *, loaded: bool = T
     """
     needed = gaussians * _GAUSSIAN_BYTES + pixels * _PIXEL_BYTES
     if loaded:
-        check_free_memory(needed, "The lift")
+        check_free_memory(needed, "The scene")  # also called when other commands open a scene
     else:
         check_free_memory(needed + _LIFT_BYTES, "The lift", {"ulimit -v": needed + _library_bytes()})
 

@@ -36,7 +36,7 @@ _WRITTEN = (
     *("field.safetensors", "evidence.safetensors", TEXT_EMBEDDINGS_FILE, "../dataparser_transforms.json"),
     *("../splat.json", "../transforms.json", "../added_photographs.json"),
 )
-"""Files that a lift writes, relative to the field folder."""
+"""Default names of files that a lift writes, relative to the field folder; see `written_files`."""
 SCHEMA_VERSION = 1
 MANIFEST_FILE = "manifest.json"
 LIFT_AGAIN = "lift again with: ns-normlift --load-config ..."
@@ -64,8 +64,8 @@ def run_directory(output_dir: Path, name: str, timestamp: str | None = None) -> 
             raise InputError(f"the {kind} must be a string, got {folder!r:.60}")
         if folder.startswith(".") or folder.strip() == "" or {"/", "\\"} & set(folder) or not folder.isprintable():
             raise InputError(
-                f"the {kind} {folder!r} is not a valid folder name; give a printable name without slashes and "
-                "without a dot at the start, such as 'run'"
+                f"the {kind} {folder!r} is not a valid folder name; give a printable, non-blank name without "
+                "slashes or a leading dot, such as 'run'"
             )
         if len(os.fsencode(folder)) > _MAX_NAME_BYTES:
             raise InputError(
@@ -127,6 +127,8 @@ def resolve_manifest_paths(manifest: Mapping[str, Any], folder: Path) -> Mapping
 def check_run(run_dir: Path) -> None:
     """Raise if a file of a lifted run has changed since the lift; for config.yml, only warn.
 
+    Safetensors files are not checked, because loading them checks their digests.
+
     Raises:
         ValueError: A file is damaged or from a different run.
     """
@@ -178,15 +180,15 @@ def refuse_existing_run(run_dir: Path, overwrite: bool, source: Path | None = No
     refuse_inputs([run_dir], instead=flags)
     complete_interrupted_writes(run_dir.parent)
     if source is not None and Path(os.path.realpath(source)).is_relative_to(os.path.realpath(run_dir)):
-        raise InputError(f"{run_dir} contains the run to lift, so the lift must not replace it; give another {flags}")
-    if not overwrite and os.path.lexists(run_dir):
-        raise FileExistsError(f"{run_dir} exists; give another {flags}, or {option_setting('overwrite', True)}.")
+        raise InputError(f"{run_dir} contains {source}, which the lift reads; give another {flags}")
     is_run = (run_dir / "config.yml").is_file() and (run_dir / FIELD_FOLDER).is_dir()
     if os.path.lexists(run_dir) and not is_run:
         raise FileExistsError(
-            f"{run_dir} has no config.yml or no {FIELD_FOLDER}/, but only lifted runs can be replaced; give another "
-            f"{flags}, or delete the folder"
+            f"{run_dir} exists and is not a lifted run, because config.yml or {FIELD_FOLDER}/ is missing. Only lifted "
+            f"runs can be replaced; give another {flags}, or delete {run_dir}."
         )
+    if not overwrite and os.path.lexists(run_dir):
+        raise FileExistsError(f"{run_dir} exists; give another {flags}, or {option_setting('overwrite', True)}.")
 
 
 def written_files(run_dir: Path) -> set[str]:
@@ -254,10 +256,10 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
         text = read_text(path)
         facts = json.loads(text)
         if not isinstance(facts, dict):
-            raise InputError(f"it contains a {type(facts).__name__}, expected a JSON object")
+            raise InputError(f"its content has type {type(facts).__name__}, expected a JSON object")
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
-            f"the semantic field in {folder} is damaged ({path}: {type(error).__name__}: {error}); {LIFT_AGAIN}"
+            f"the semantic field in {folder} is damaged or cannot be read ({path}: {error}); {LIFT_AGAIN}"
         ) from error
     if facts.get("schema_version") != SCHEMA_VERSION or isinstance(facts["schema_version"], bool):
         version = repr(facts.get("schema_version"))[:50]
@@ -306,7 +308,7 @@ def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapp
         wanted = None if expected is None else expected.get(name)
         if digest is None or digest != wanted:
             raise InputError(
-                f"{folder / name} and its manifest are from different lifts: the digest of the file is "
+                f"{folder / name} and the files next to it are from different lifts: the digest of the file is "
                 f"{digest or 'missing'}, and that in the manifest is {wanted or 'missing'}; {LIFT_AGAIN}"
             )
 
@@ -335,8 +337,8 @@ def check_file_digests(folder: Path) -> None:
             continue
         if path.stat().st_size > _LARGE and path.suffix == ".ckpt" and not _ends_as_archive(path):
             raise InputError(
-                f"{path} is damaged: it is not a ZIP archive, as checkpoints are; copy the whole run again, "
-                f"or {LIFT_AGAIN}"
+                f"{path} is damaged: checkpoints are ZIP archives, but this file does not end like one; copy the whole "
+                f"run again, or {LIFT_AGAIN}"
             )
         actual = file_digest(path)
         if actual != expected:

@@ -73,7 +73,7 @@ class QueryField(HasManifest, Protocol):
 class Answer:
     """Result of a query with Q prompts. `answer["fox"]` is the result for one prompt; see `Finding`.
 
-    Arrays are torch tensors on the device of the field, or NumPy arrays on the command line.
+    Arrays are like those of the field: torch tensors on its device, or NumPy arrays.
 
     >>> import torch
     >>> from normlift_ns import Evidence, SemanticField, lift
@@ -136,9 +136,7 @@ class Answer:
             KeyError: `text` is not a prompt of the query.
         """
         if text not in self.texts:
-            raise KeyError(
-                f"{text!r} is not a prompt of this query; its prompts are {', '.join(map(repr, self.texts))}"
-            )
+            raise KeyError(f"{text!r} is not a prompt of this query. Prompts: {', '.join(map(repr, self.texts))}")
         return Finding(self, self.texts.index(text))
 
     def numpy(self) -> dict[str, np.ndarray]:
@@ -258,7 +256,7 @@ class Finding:
 
     @property
     def suggested_threshold(self) -> float | None:
-        """Threshold that the histogram suggests for this prompt."""
+        """Threshold that the histogram suggests for this prompt; None if no Gaussian has a direction."""
         return None if self.histogram is None else self.histogram.suggested
 
     @cached_property

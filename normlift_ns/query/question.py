@@ -21,7 +21,16 @@ from normlift_ns.core.relevancy import RELEVANCY_RULES
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import check_array, load_arrays, save_arrays
 from normlift_ns.io.run_dir import MANIFEST_FILE, read_manifest
-from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, check_bool, check_number, renamed, short_repr
+from normlift_ns.options import (
+    CANONICAL_NEGATIVES,
+    RelevancyRule,
+    check_bool,
+    check_number,
+    option_name,
+    option_setting,
+    renamed,
+    short_repr,
+)
 from normlift_ns.query.text_encoder import DefaultRule, HasManifest, default_rule, encoder_digest
 
 _PROMPT = re.compile(r'\s*(?:"([^"]*)"|([^,;\n]*))\s*(?:[,;\n]|$)')
@@ -45,9 +54,7 @@ def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
     """
     prompts = tuple(dict.fromkeys(prompt for text in texts for prompt in split_prompts(text)))
     if len(texts) > 0 and len(prompts) == 0:
-        raise InputError(
-            f"{name} has only blanks and separators, got {', '.join(map(repr, texts))}; give at least one prompt"
-        )
+        raise InputError(f"{name} contains no prompt, got {', '.join(map(repr, texts))}; give at least one prompt")
     return prompts
 
 
@@ -123,9 +130,9 @@ def make_query(
             needs negatives.
         relevancy: Relevancy rule. "auto" is the rule of `default_rule` if `negatives` is None, cosine if `negatives` is
             empty, and lerf otherwise.
-        threshold: Relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests. If
-            None, the default rule of the field has the threshold of `default_rule`. Another rule has its threshold in
-            `RELEVANCY_RULES` if it needs negatives, else "auto", because no threshold suits all encoders.
+        threshold: Relevancy above which a Gaussian is selected. "auto" is the threshold that the histogram suggests.
+            None is the threshold of `default_rule` for the default rule of the field. For other rules, it is that of
+            `RELEVANCY_RULES` if the rule needs negatives, else "auto", because no threshold suits all encoders.
         min_reliability: Minimum reliability R of a selected Gaussian, in 0..1.
         refined: Use refined features.
     Raises:
@@ -173,7 +180,8 @@ def _resolve_negatives(
     if negatives is None:
         return tuple(default.negatives or needed)
     if needed and len(negatives) == 0:
-        raise InputError(f"relevancy {relevancy} needs negatives, but negatives is empty. Give at least one negative.")
+        rule, names = option_setting("relevancy", relevancy), option_name("negatives")
+        raise InputError(f"{rule} needs at least one entry in {names}, got none")
     return tuple(negatives)
 
 
@@ -227,12 +235,12 @@ def save_query(folder: Path, question: Query) -> Path:
     if not folder.is_dir():
         raise FileNotFoundError(
             f"{folder} no longer exists, so the query was not stored. The run was moved or deleted while it was open. "
-            "Open the run again at its new path."
+            "If it was moved, open it again at its new path."
         )
     if question.suggest_threshold:
         raise InputError(
-            'The query cannot be stored because its threshold is "auto". Run the query, and store the query of its '
-            "answer."
+            'The query cannot be stored because its threshold is "auto". Run the query, then store the `question` of '
+            "its answer."
         )
     metadata = _Metadata(**{name: getattr(question, name) for name in _Metadata.__struct_fields__})
     rows = zip(_VECTORS, (question.embeddings, question.negative_embeddings))
@@ -250,20 +258,20 @@ def load_query(folder: Path) -> Query | None:
     """Load the query stored in the folder of a field; return None if it has no stored query.
 
     Raises:
-        ValueError: The file is damaged, or does not contain a query.
+        ValueError: The file is damaged, contains no query, or does not match the field.
     """
     path = folder / QUERIES_FILE
     if not os.path.lexists(path):
         return None
     if not os.path.isfile(path):
-        raise InputError(f"{path} is not a regular file; {_REMEDY}")
+        raise InputError(f"{path} is not a regular file; delete it")
     arrays, metadata, _ = load_arrays(path, legacy_keys=(_METADATA_KEY,), remedy=_REMEDY)
     try:
         if set(metadata) != {_METADATA_KEY}:
             raise InputError(f"its metadata keys are {sorted(metadata)}, expected {_METADATA_KEY}")
         return _decode(folder, metadata[_METADATA_KEY], arrays)
     except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
-        raise InputError(f"{path} is damaged ({error}); {_REMEDY}") from error
+        raise InputError(f"{path} cannot be used ({error}); {_REMEDY}") from error
 
 
 def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
@@ -286,7 +294,7 @@ def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
         found = "no array" if negative is None else "an array"
         raise InputError(f"its number of negatives is {len(metadata.negatives)}, but it has {found} negative_vectors")
     if RELEVANCY_RULES[metadata.rule].needs_negatives and negative is None:
-        raise InputError(f"the rule {metadata.rule!r} needs negatives, but the file has none")
+        raise InputError(f"the rule {metadata.rule!r} needs negatives, but there are none")
     size = arrays["vectors"].shape[-1] if arrays["vectors"].ndim > 0 else 0
     _check_vectors("vectors", arrays["vectors"], metadata.texts, size)
     if negative is not None:
@@ -311,7 +319,7 @@ def _check_encoder(question: Query, manifest: Mapping[str, Any]) -> None:
 
 
 def _check_vectors(name: str, vectors: np.ndarray, texts: Sequence[str], size: int) -> None:
-    check_array(f"{name} of {len(texts)} texts", vectors, "float32", (len(texts), max(1, size)), -math.inf)
+    check_array(f"the array {name}", vectors, "float32", (len(texts), max(1, size)), -math.inf)
     for text, row in zip(texts, vectors):
         if not np.isfinite(row).all() or not row.any():
             raise InputError(f"the vector of {text!r} is zero or not finite")

@@ -132,8 +132,7 @@ def mask_evidence(
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(
-            f"expected one set of masks per camera, and at least one camera; got {len(masks)} sets for "
-            f"{len(cameras)} cameras"
+            f"cameras and masks must have the same length, at least 1; got lengths {len(cameras)} and {len(masks)}"
         )
     labels: list[Int32[Tensor, "h w"]] = []
     inside: list[Bool[Tensor, "q c"]] = []

@@ -23,7 +23,7 @@ from normlift_ns.encoders.registry import (
 from normlift_ns.encoders.text_files import CachedTextEncoder, LazyTextEncoder, TextEmbeddingFile
 from normlift_ns.errors import InputError
 from normlift_ns.io.atomic import text_digest
-from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions, names_of_0_2
+from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions, names_of_0_2, option_name
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
 """Options that determine the encoder or the text embeddings of a field, by the names in manifests (version 0.2)."""
@@ -112,8 +112,8 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
         if vectors.dimension != field.manifest.get("dimension", vectors.dimension):
             raise InputError(
                 f"the vectors in {vectors.file} have {vectors.dimension} dimensions, but the features of the run have "
-                f"{field.manifest['dimension']}. Give a file of text vectors from the encoder of these features with "
-                "--text-embeddings."
+                f"{field.manifest['dimension']}. Set {option_name('text_embeddings')} to a file of text embeddings "
+                "from the encoder of these features."
             )
         return vectors
     try:
@@ -121,8 +121,8 @@ def text_encoder_for(field: HasManifest, device: str = "cpu", cache: Path | None
     except InputError as error:
         problem = str(error).partition(";")[0]  # the rest suggests another encoder, which a lifted run cannot use
         raise InputError(
-            f"The encoder of this run is not available: {problem}. Install or repair its package, or give a file of "
-            "text vectors from that encoder with --text-embeddings."
+            f"The encoder of this run is not available: {problem}. Install or repair its package, or set "
+            f"{option_name('text_embeddings')} to a file of text embeddings from that encoder."
         ) from None
     recorded = _identity(field.manifest.get("features"))
     if kind.texts is not None:
@@ -146,8 +146,8 @@ def _cached_texts(
             raise InputError(
                 f"The encoder {options.encoder} on this machine differs from the one that the lift used, so results "
                 f"would differ. Its settings are {encoder.identity}, expected {dict(recorded)}. Restore the original "
-                "files of the encoder, give a file of text embeddings from the same network with --text-embeddings, or "
-                "lift again with: ns-normlift"
+                f"files of the encoder, set {option_name('text_embeddings')} to a file of text embeddings from the "
+                "same network, or lift again with: ns-normlift"
             )
         return encoder
 
@@ -175,8 +175,8 @@ def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
 def _check_vectors(path: Path, expected: object) -> None:
     """Read a whole file of text embeddings, and raise if its content has changed since the lift."""
     remedy = (
-        "restore the file, give a file of text vectors from the same network with --text-embeddings, or lift again "
-        "with: ns-normlift"
+        f"restore the file, set {option_name('text_embeddings')} to a file of text embeddings from the same network, "
+        "or lift again with: ns-normlift"
     )
     if os.path.lexists(path) and not path.is_file():
         raise InputError(f"the run's file of text embeddings {path} is no longer a regular file; {remedy}")
@@ -196,8 +196,8 @@ def _options(field: HasManifest) -> SourceOptions:
     vectors = stored["text_vectors"]
     if stored["encoder"] == PRECOMPUTED and vectors is None:
         raise InputError(
-            "This run was lifted from your own features without text embeddings. Give a file of texts and their "
-            "vectors with --text-embeddings, or lift again with text embeddings."
+            "This run was lifted from your own features without text embeddings. Set "
+            f"{option_name('text_embeddings')} to a file of text embeddings, or lift again with the argument texts."
         )
     placeholder = {"encoder": "open_clip"} if stored["encoder"] == PRECOMPUTED else {}  # never loaded
     return SourceOptions.stored({**stored, **placeholder})

@@ -79,7 +79,7 @@ def test_what_the_cache_no_longer_holds_is_named(run: nl.LiftedRun, tmp_path: Pa
 
 def test_photographs_that_are_gone_replaced_or_unknown_are_named(run, trained: Path, tmp_path: Path) -> None:
     names = run.field.manifest["views_lifted"]
-    for told, message in ((None, "older version"), ([1], "older version"), ([*names, "x.png"], r"1 of 7 .*x\.png")):
+    for told, message in ((None, "not record"), ([1], "not record"), ([*names, "x.png"], r"1 of 7 .*x\.png")):
         other = replace(run.field, manifest={**run.field.manifest, "views_lifted": told})
         with pytest.raises(nl.InputError, match=message):
             _ = RecordedVotes(run.scene, other, tmp_path).names

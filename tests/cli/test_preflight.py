@@ -63,7 +63,7 @@ LIFT = [
     ("--threshold 0.5", "--threshold"),
     ("--device cuda:x:", "--device must be auto, cpu or cuda, or a GPU such as cuda:1; got 'cuda:x:'"),
     ("--timestamp ../x", "'../x'", "folder name"),
-    ("--timestamp old", "old exists", "--timestamp", "--output-dir", "--overwrite True"),
+    ("--timestamp old", "old exists", "--timestamp", "--output-dir", "not a lifted run"),
     ("--output-dir file", "file, given with --output-dir"),
     ("--output-dir dangling/x", "dangling", "link"),
     ("--export-langsplat file", "file, given with --export-langsplat"),

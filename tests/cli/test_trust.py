@@ -44,7 +44,7 @@ def test_no_output_of_a_command_replaces_what_is_not_ours(own: Path, tmp_path: P
         (export, (*ask, "--output-dir", tmp_path / "new", "--masks-dir", room / "images", *over), "data set"),
         (export, (*ask, "--output-dir", out, "--output-filename", "cloud.ply", "--transfer", cloud, *over), "input"),
         (export, (*ask, "--output-dir", out, "--output-filename", "diary.txt", *over), "diary"),
-        (lift, ("--load-config", config, *QUICK, "--timestamp", "t", *over), "contains the run to lift"),
+        (lift, ("--load-config", config, *QUICK, "--timestamp", "t", *over), "which the lift reads"),
         (query, (*ask, "--relevancy", "lerf", "--negatives"), "negatives"),
         (lift, ("--load-config", own, *QUICK, "--regions", "sam", "--sam-model", "~/x"), "~/x"),
     ):  # fmt: skip

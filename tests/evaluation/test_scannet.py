@@ -69,9 +69,8 @@ def test_sets_are_those_of_the_protocol():
 
 
 def test_what_cannot_be_scored_is_refused(tmp_path):
-    scene = scannet.SceneLabels(
-        "s", torch.zeros(3, 19), torch.ones(3).bool(), torch.full((3,), 0.5), torch.tensor([1, 2, 3])
-    )
+    half = torch.full((3,), 0.5)
+    scene = scannet.SceneLabels("s", torch.zeros(3, 19), half > 0, half, torch.tensor([1, 2, 3]))
     with pytest.raises(InputError, match=r" s .*--min-opacity"):
         scannet.evaluate_scannet([scene], ScannetOptions(min_opacity=1))
     scannet.check_identity("s", 4, np.zeros(4), tmp_path / "labels.ply")

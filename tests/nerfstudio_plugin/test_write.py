@@ -76,7 +76,7 @@ def test_an_existing_directory_is_replaced_only_if_told(copied: Path, field: Sem
     assert {path: path.read_text() for path in mine} == mine and os.listdir(run_dir.parent) == ["now"]
     assert sorted(os.listdir(run_dir / "nerfstudio_models")) == ["a.ckpt", CHECKPOINT]
     lifted = opened(run_dir / "config.yml")
-    with pytest.raises(InputError, match="contains the run to lift"):
+    with pytest.raises(InputError, match="which the lift reads"):
         write(lifted, field, timestamp="now", overwrite=True)
     (run_dir / "added_photographs.json").write_text("mine")  # a name of ours that the manifest does not list
     assert write(source, field, timestamp="now", overwrite=True) == run_dir

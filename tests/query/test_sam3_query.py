@@ -46,7 +46,7 @@ def test_shares_agreement_and_reliability_are_their_formulas():
         torch.testing.assert_close(answer.scalars.reliability[known], reliability[known], **close)
         assert answer.voting_views.tolist() == there.tolist()
     mask = torch.zeros(1, 24, 40, dtype=torch.bool)
-    with pytest.raises(ValueError, match="2 sets for 3 cameras"):
+    with pytest.raises(ValueError, match="lengths 3 and 2"):
         mask_evidence(scene, cameras, [mask, mask])
     with pytest.raises(ValueError, match=r"view 1 .*\(1, 24, 39\), .*\[1, 24, 40\]"):
         mask_evidence(scene, cameras, [mask, mask[:, :, 1:], mask])

@@ -115,7 +115,7 @@ def test_replaced_text_vectors_are_refused_unless_they_are_chosen(tmp_path: Path
     field = field_with(settings, {"kind": "langsplat", "level": "l", "texts": TextEmbeddingFile(path).identity})
     assert torch.is_tensor(text_encoder_for(field).text(["fox"]))
     np.savez(path, fox=np.arange(12, dtype=np.float32))
-    with pytest.raises(InputError, match=rf"{path} .*--text-embeddings"):
+    with pytest.raises(InputError, match=rf"{path} .* text_embeddings"):
         text_encoder_for(field)
     assert torch.is_tensor(text_encoder_for(with_text_source(field, text_embeddings=path)).text(["fox"]))
     path.unlink()
