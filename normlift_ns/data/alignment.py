@@ -168,8 +168,8 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
     reason = match.cause or f"{causes}."
     if match.margin < MIN_MARGIN:
         problem = (
-            f"The splat does not match its images: renders of training views reach a PSNR of "
-            f"{match.psnr:.1f} dB, {abs(match.margin):.1f} dB {'less' if match.margin < 0 else 'more'} than the mean color of an image. "
+            f"The splat does not match its images: renders of training views reach a PSNR of {match.psnr:.1f} dB, "
+            f"{abs(match.margin):.1f} dB {'less' if match.margin < 0 else 'more'} than the mean color of an image. "
             f"Expected at least {MIN_MARGIN:.0f} dB more. {reason}"
         )
         if not trained_cameras:

@@ -74,7 +74,7 @@ class TrainedViews(SplitViews):
         distortion = [] if self._split.distortion is None else self._split.distortion[index].tolist()
         needed = _NUM_DISTORTION[kind]
         if any(distortion) and len(distortion) < needed:
-            raise InputError(f"the distortion {distortion} cannot be removed (expected {needed} parameters)")
+            raise InputError(f"the distortion {distortion} cannot be removed (expected at least {needed} parameters)")
         k1, k2, k3, k4, p1, p2 = [*distortion, *[0.0] * 6][:6]
         fx, fy, cx, cy = self._split.intrinsics[index].tolist()
         width, height = self._sizes[index]
@@ -294,9 +294,9 @@ def _check_transform(
     is_close = gap <= _TRANSFORM_TOLERANCE and abs(scale / trained.scale - 1) <= _TRANSFORM_TOLERANCE
     if not is_close:  # or NaN
         raise InputError(
-            f"The dataset {location.data} has changed since the training of {location.run_dir}: frames were added, "
-            f"removed or moved. Its poses give scale {scale:.6g}, but {file.name} has {trained.scale:.6g}, and the "
-            f"numbers of the transforms differ by up to {gap:.3g}. Restore the camera file of the dataset{advice}."
+            f"The cameras of the dataset {location.data} are not those of the training of {location.run_dir}. Their "
+            f"poses give scale {scale:.6g}, and {file.name} has {trained.scale:.6g}; the numbers of the transforms "
+            f"differ by up to {gap:.3g}. Restore the camera file of the dataset{advice}."
         )
     return ()
 
