@@ -268,10 +268,10 @@ class SplitViews:
         return image_warnings(self.files, headers)
 
     def _check_size(self, index: int, size: Sequence[int]) -> None:
-        expected = self._sizes[index]
+        expected, scaled = self._sizes[index], "" if self._scale == 1 else f" (scaled by {self._scale:g})"
         if list(size) != list(expected):
             raise InputError(
-                f"{self.files[index]} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
+                f"{self.files[index]}{scaled} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
                 f"{expected[1]} (width x height). Use the images that the {self._TRAINED} was trained with."
             )
 

@@ -259,7 +259,8 @@ CONFIG_TARGETS: dict[str, str | None] = {
     else CLASS_TARGETS.get(cls)
     for name, cls in CONFIG_CLASSES.items()
 }
-"""Name of the class that each configuration class instantiates, keyed by the name of the configuration class."""
+"""Name of the class or function that each configuration class instantiates, keyed by the name of the configuration
+class; None if there is none."""
 _TARGETS = {target for target in CONFIG_TARGETS.values() if target is not None}
 _TARGET = "_target"
 """Field of a config.yml with the class or function that a configuration class instantiates.

@@ -240,8 +240,8 @@ def load_nerfstudio_scene(
     gaussians = checkpoint.splat.activated
     if not bool(gaussians.drawable.any()):
         raise InputError(
-            f"{checkpoint.path}: all {len(gaussians):,} Gaussians have NaN or infinite parameters, or zero "
-            "quaternions, so they cannot be rendered. Give another checkpoint with --load-step."
+            f"{checkpoint.path}: all {len(gaussians):,} Gaussians have parameters that are NaN, infinite or too large, "
+            "or zero quaternions, so they cannot be rendered. Give another checkpoint with --load-step."
         )
     dataset = parse_dataset(datamanager, data_given=data is not None)
     advice = "" if data is not None else ", or give the path of the dataset with --data"
