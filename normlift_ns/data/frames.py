@@ -57,8 +57,8 @@ def read_image_header(file: Path) -> ImageHeader:
         ) from error
     if format_ not in _FORMATS or max(size) > _MAX_SIDE or min(size) < 1:
         raise InputError(
-            f"{file} cannot be read as an image: its format is {format_}, with {size[0]} x {size[1]} pixels. Expected "
-            f"JPEG, PNG, WebP, TIFF or BMP with at most {_MAX_SIDE:,} pixels along a side."
+            f"{file} cannot be read as an image: its format is {format_}, and its size is {size[0]} x {size[1]} "
+            f"pixels. Expected JPEG, PNG, WebP, TIFF or BMP with at most {_MAX_SIDE:,} pixels along a side."
         )
     return ImageHeader(size, mode, rotated, multi_frame)
 

@@ -88,8 +88,8 @@ def _matching(requested: str, names: Sequence[str]) -> list[str]:
         matches = [name for name in names if str(short(Path(name))) == str(path)]
         if len(matches) > 1:
             raise InputError(
-                f"--eval-images {requested} matches {len(matches)} images, such as {matches[0]} and {matches[1]}. Give "
-                "the full name."
+                f"--eval-images {requested} matches {len(matches)} images; the first two are {matches[0]} and "
+                f"{matches[1]}. Give the full name."
             )
         if matches:
             return matches

@@ -481,7 +481,7 @@ def check_components(config: Any, path: Path) -> None:
         if cls.__name__ not in classes or full_name not in CONFIG_TARGETS:
             raise InputError(
                 f"{path} has the method {str(config.method_name)!r}, but its {name} is {full_name}, expected "
-                f"{' or '.join(classes)} of nerfstudio or normlift_ns. Only stock splatfacto runs can be lifted. "
+                f"{' or '.join(classes)}. Only stock splatfacto runs can be lifted. "
                 f"{export_advice(path)}"
             )
 

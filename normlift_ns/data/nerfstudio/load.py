@@ -295,7 +295,7 @@ def _check_transform(
     if not is_close:  # or NaN
         raise InputError(
             f"The cameras of the dataset {location.data} are not those of the training of {location.run_dir}. Their "
-            f"poses give scale {scale:.6g}, and {file.name} has {trained.scale:.6g}; the numbers of the transforms "
+            f"poses give the scale {scale:.6g}, and {file.name} has {trained.scale:.6g}; the numbers of the transforms "
             f"differ by up to {gap:.3g}. Restore the camera file of the dataset{advice}."
         )
     return ()
