@@ -107,8 +107,7 @@ def test_other_writers_of_the_same_formats_are_read(tmp_path: Path) -> None:
     (tmp_path / "my scene.bin").write_bytes(binary)
     path = tmp_path / "scene.gltf"
     path.write_text(json.dumps(document))
-    plain = _read(path).splat
-    assert torch.equal(plain.means, splat.means)
+    assert torch.equal(_read(path).splat.means, splat.means)
     document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
     attributes, quats = _primitive(document)["attributes"], normalize_quats(splat.quats).roll(-1, dims=1)
     packed = (quats * 32767).round().short().numpy().tobytes()

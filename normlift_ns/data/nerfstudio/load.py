@@ -141,7 +141,7 @@ class NerfstudioScene:
     """Evaluation views."""
     dataparser_transform: Float[Tensor, "3 4"]
     dataparser_scale: float
-    """Scale of the map from the dataset to the world of the scene: scale * (dataparser_transform @ point)."""
+    """Scale of the map from the capture to the world of the scene: dataparser_scale * (dataparser_transform @ point)."""
     identity: Mapping[str, Any]
     """Path of the config and step of the checkpoint for the manifest; for lifted runs, also the version of gsplat."""
     remarks: tuple[str, ...] = ()
@@ -277,7 +277,7 @@ def _check_transform(
     nerfstudio computes the world of the Gaussians from all poses, so a changed dataset leads to another world.
 
     Args:
-        transform, scale: Map from the poses in the dataset to the world of the Gaussians.
+        transform, scale: Map from the world of the capture to the world of the Gaussians, computed from the dataset.
         location: Paths of the run.
         advice: Alternative to restoring the dataset, for error messages.
     Returns:
