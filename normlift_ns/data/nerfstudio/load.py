@@ -141,7 +141,7 @@ class NerfstudioScene:
     """Evaluation views."""
     dataparser_transform: Float[Tensor, "3 4"]
     dataparser_scale: float
-    """Scale of the map from the capture to the world of the scene: dataparser_scale * (dataparser_transform @ point)."""
+    """Scale of the map from the capture to the world of the scene: scale * (dataparser_transform @ point)."""
     identity: Mapping[str, Any]
     """Path of the config and step of the checkpoint for the manifest; for lifted runs, also the version of gsplat."""
     remarks: tuple[str, ...] = ()
