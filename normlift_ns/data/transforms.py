@@ -129,7 +129,7 @@ def read_json_file(path: Path, expected: str) -> Any:
         return msgspec.json.decode(text)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         invalid = next((word for word in ("NaN", "Infinity") if word.encode() in text), None)
-        reason = str(error) if invalid is None else f"it contains {invalid}"
+        reason = str(error) if invalid is None else f"{error}; JSON does not allow {invalid}"
         raise InputError(f"{path} is not valid JSON ({reason}). Expected {expected}.") from error
 
 
@@ -264,7 +264,7 @@ def read_transforms(
 
 
 def _held_out(entries: TransformsEntries, root: Path, path: Path) -> list[bool]:
-    """Return True for each frame that the file excludes from the training.
+    """Return a list with True for each frame that the file excludes from the training.
 
     As in nerfstudio, a list must not contain files without a frame.
     """
