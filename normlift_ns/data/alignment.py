@@ -148,23 +148,28 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
         ValueError: The views contain almost no Gaussians. Also if the margin is below `MIN_MARGIN` and
             `trained_cameras` is False.
     """
+    other_cameras = (
+        "cameras of another capture, or in another world than the splat (see --world-transform and, for gsplat's "
+        "trainer, --gsplat-normalize)"
+    )
+    if match.visible_fraction < _MIN_VISIBLE:
+        cause = "cameras that have changed since the training" if trained_cameras else other_cameras
+        raise InputError(
+            "The cameras do not show this splat: each training view that was checked contains at most "
+            f"{match.visible_fraction:.2%} of the Gaussians. Likely cause: {cause}. To lift anyway, give "
+            "--check-alignment False."
+        )
     causes = "Likely causes: " + (
         "the images, their exposure or the cameras have changed since the training, or the training was stopped early"
         if trained_cameras
-        else "cameras of another capture, or in another world than the splat (give a file with --world-transform; for "
-        "gsplat's trainer, see --gsplat-normalize); images that are distorted, have a different exposure or are much "
-        "smaller than the training images; or another --rasterize-mode or --background"
+        else f"{other_cameras}; images that are distorted, have a different exposure or are much smaller than the "
+        "training images; or another --rasterize-mode or --background"
     )
-    if match.visible_fraction < _MIN_VISIBLE:
-        raise InputError(
-            "The cameras do not show this splat: each training view that was checked contains at most "
-            f"{match.visible_fraction:.2%} of its Gaussians. {causes}. To lift anyway, give --check-alignment False."
-        )
     reason = match.cause or f"{causes}."
     if match.margin < MIN_MARGIN:
         problem = (
-            f"The splat does not match its images: renders of training views reach {match.psnr:.1f} "
-            f"dB, {abs(match.margin):.1f} dB {'less' if match.margin < 0 else 'more'} than the mean color of an image. "
+            f"The splat does not match its images: renders of training views reach a PSNR of {match.psnr:.1f} dB, "
+            f"{abs(match.margin):.1f} dB {'less' if match.margin < 0 else 'more'} than the mean color of an image. "
             f"Expected at least {MIN_MARGIN:.0f} dB more. {reason}"
         )
         if not trained_cameras:

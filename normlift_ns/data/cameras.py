@@ -37,7 +37,7 @@ def read_camera_file(options: SplatOptions, advice: str | None = None) -> Camera
         )
     for name, folder in (("--images", options.images), ("--masks", options.masks)):
         if folder is not None and not folder.is_dir():
-            raise FileNotFoundError(f"The folder {folder}, given with {name}, does not exist. Give an existing folder.")
+            raise FileNotFoundError(f"{folder}, given with {name}, is not an existing folder. Give another path.")
     if advice is None:
         is_given = options.images is not None
         advice = "remove them from the camera file" if is_given else GIVE_IMAGES
@@ -70,8 +70,8 @@ def adjust_poses(
         hint = " The trainer holds out every 8th image: give --test-every 8." if len(deltas) == without_eighth else ""
         raise InputError(
             f"{path} has pose adjustments for {len(deltas)} training views (--pose_opt), but {len(trained)} of "
-            f"{len(frames)} images are training views. Give the held-out images with --test-every or "
-            f"--eval-images.{hint}"
+            f"{len(frames)} images are training views. Give the camera file of the training, and its held-out images "
+            f"with --test-every or --eval-images.{hint}"
         )
     by_name = {}
     for frame, delta in zip(trained, deltas.numpy()):

@@ -130,8 +130,8 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
     checkpoints = {number: path for path in found if (number := _step_of(path)) is not None}
     if not checkpoints:
         raise FileNotFoundError(
-            f"{folder} has no checkpoint. Expected a file such as step-000029999.ckpt, which ns-train writes "
-            "every --steps-per-save steps and at the end. Copy it to this folder, or finish the training."
+            f"{folder} has no checkpoint. Expected a file such as step-000029999.ckpt. Copy the whole run again; if "
+            "its training ended before the first checkpoint, train again."
         )
     if step is None:
         return checkpoints[max(checkpoints)]
@@ -175,8 +175,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     missing = [_PREFIX + name for name in GAUSSIAN_PARAMETERS if _PREFIX + name not in model]
     if missing:
         raise InputError(
-            f"{path} does not contain splatfacto Gaussians: {', '.join(missing)} missing. Give another checkpoint with "
-            "--load-step, or lift a PLY file of the scene with --load-ply."
+            f"{path} does not contain splatfacto Gaussians (missing: {', '.join(missing)}). Give another checkpoint "
+            "with --load-step, or lift a PLY file of the scene with --load-ply."
         )
     known = {*GAUSSIAN_PARAMETERS, "normals"}
     extra = (name.removeprefix(_PREFIX) for name in model if name.startswith(_PREFIX))
@@ -284,7 +284,7 @@ def _model_state(pipeline: dict[Any, Any], path: Path) -> dict[str, Tensor]:
         if not model or not isinstance(value, Tensor) or rest.startswith("lpips."):
             continue
         if rest in state:
-            raise InputError(f"{path} contains {rest} twice, expected every tensor once. Copy it again.")
+            raise InputError(f"{path} contains {rest} twice, expected every tensor once. Give another checkpoint.")
         check_dense_tensor(value, rest, path)
         state[rest] = value.detach().clone()
     return state
@@ -330,7 +330,9 @@ def read_gsplat_checkpoint(path: Path) -> SplatFile:
     splats = [splat_from_parameters(rank.parameters, file) for file, rank in zip(files, loaded)]
     steps = {rank.step for rank in loaded}
     if len(steps) > 1 or len({splat.degree for splat in splats}) > 1:
-        differing = f"steps: {', '.join(map(str, sorted(steps)))}" if len(steps) > 1 else "spherical harmonics"
+        differing = (
+            f"steps: {', '.join(map(str, sorted(steps)))}" if len(steps) > 1 else "degrees of spherical harmonics"
+        )
         raise InputError(
             f"{files[0].parent} has ranks with different {differing}. "
             "Expected the files of one training run. Copy these files to a separate folder."
@@ -359,7 +361,7 @@ def _rank_files(path: Path) -> tuple[Path, ...]:
     if max(ranks) >= len(ranks):
         missing = next(rank for rank in range(len(ranks)) if rank not in ranks)
         raise FileNotFoundError(
-            f"{path.parent} has {match[1]}* up to {max(ranks)}, but not rank {missing}. Every "
+            f"{path.parent} has {match[1]}* up to rank {max(ranks)}, but not rank {missing}. Every "
             "rank contains a part of the Gaussians. Copy all files of the training run."
         )
     return tuple(ranks[rank] for rank in sorted(ranks))
@@ -403,7 +405,7 @@ def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
             hint = "For a nerfstudio run, give its config.yml with --load-config"
         elif isinstance(loaded, tuple):
             hint = "For Inria's trainer, give point_cloud/iteration_…/point_cloud.ply with --load-ply"
-        raise InputError(f"{path} is not a gsplat checkpoint: expected `splats`, found {keys}. {hint}.")
+        raise InputError(f"{path} is not a gsplat checkpoint: expected tensors in `splats`, found {keys}. {hint}.")
     if "app_module" in loaded:
         raise InputError(
             f"{path} contains an appearance network, `app_module` (--app_opt), which computes the colors of its "

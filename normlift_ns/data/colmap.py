@@ -63,8 +63,8 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
     """
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"The folder {folder} does not exist. Give the folder of the COLMAP project, which contains images/ and "
-            "sparse/0, with --colmap."
+            f"{folder} is not an existing folder. Give the folder of a COLMAP project, such as one with images/ and "
+            "sparse/0."
         )
     if _is_model(folder):
         return folder
@@ -74,7 +74,7 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
     if len(models) == 0:
         raise FileNotFoundError(
             f"{folder} contains no COLMAP reconstruction: cameras.bin and cameras.txt are missing from it and from "
-            f"its {', '.join(_MODEL_FOLDERS)}. With --colmap, give the folder that contains sparse/0."
+            f"its {', '.join(_MODEL_FOLDERS)}. Give the folder that contains sparse/0."
         )
     if len(models) == 1:
         return models[0]
@@ -83,7 +83,7 @@ def find_colmap_model(folder: Path, say: Callable[[str], None] = lambda text: No
     listed = ", ".join(f"{relative_name(model, folder)} (images: {count:,})" for model, count in counts.items())
     say(
         f"{folder} contains several reconstructions: {listed}. The largest one, {relative_name(largest, folder)}, is "
-        "used. To use another one, give its folder with --colmap."
+        "used. To use another one, give its folder instead."
     )
     return largest
 
@@ -174,7 +174,8 @@ def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera]
         if not (np.abs(pose) < _MAX_VALUE).all() or not np.any(pose[:4]):
             raise InputError(
                 f"{model}: {image.name} has the quaternion {image.rotation} and the translation {image.translation}. "
-                f"Expected finite numbers, and a quaternion that is not zero. {_ADVICE}"
+                f"Expected numbers between {-_MAX_VALUE:g} and {_MAX_VALUE:g}, and a quaternion that is not zero. "
+                f"{_ADVICE}"
             )
     orphans = [image for image in images if image.camera_id not in cameras]
     if orphans or len(images) == 0:
@@ -185,7 +186,7 @@ def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera]
         )
         raise InputError(
             f"{model} is incomplete: {problem} (cameras: {len(cameras)}, registered images: {len(images)}). Expected "
-            "one or more images, each with its camera. Copy the whole reconstruction again."
+            "one or more images, each with its camera. Copy the whole reconstruction again, or run COLMAP again."
         )
     if len({image.image_id for image in images}) < len(images):
         raise InputError(f"{model} has two images with the same ID. {_ADVICE}")
@@ -207,8 +208,8 @@ def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
         numbers = "".join(f", {name} = {value:g}" for name, value in extra.items())
         raise InputError(
             f"{model}: camera {camera.camera_id} has the model {camera.model}{numbers}, expected one of "
-            f"{', '.join(_MODELS)}. Undistort the images, keep the splat, and give the new folder with "
-            f"--colmap: colmap image_undistorter --image_path IMAGES --input_path {model} --output_path new"
+            f"{', '.join(_MODELS)}. Keep the splat, undistort the images, and give the folder that this "
+            f"command writes: colmap image_undistorter --image_path IMAGES --input_path {model} --output_path new"
         )
     lens = Intrinsics(**parameters, width=camera.width, height=camera.height)  # pyrefly: ignore[bad-argument-type]
     return lens.as_fisheye() if "FISHEYE" in camera.model else lens
@@ -279,8 +280,8 @@ def _check_formats(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapI
     ]
     if len(differ) > 0:
         raise InputError(
-            f"{model} is contradictory: the cameras of {differ[0]} in the .bin and .txt files differ "
-            f"({len(differ)} of {len({**first, **second})} images). COLMAP and gsplat read the .bin files; nerfstudio "
+            f"{model} is contradictory: its .bin and .txt files differ in the camera of {differ[0]} (number of such "
+            f"images: {len(differ)} of {len({**first, **second})}). COLMAP and gsplat read the .bin files; nerfstudio "
             "reads the .txt files. Keep only those that the splat was trained with: "
             f"rm {model / '*.txt'}, or rm {model / '*.bin'}"
         )
@@ -313,7 +314,8 @@ def _read(
     if not path.is_file():
         found = f"has cameras.txt, but not {name}.txt" if as_text else f"has neither {name}.bin nor {name}.txt"
         raise FileNotFoundError(
-            f"{model} {found}. Expected cameras, images and points3D, as COLMAP's mapper writes them. {_ADVICE}"
+            f"{model} {found}. Expected cameras, images and points3D, as COLMAP's mapper writes them. Copy the whole "
+            "reconstruction again."
         )
     try:
         if path.suffix == ".bin":

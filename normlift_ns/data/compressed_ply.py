@@ -64,8 +64,8 @@ def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor],
     _check_element(path, "vertex", vertex, _VERTEX, "u")
     assert chunk is not None
     if n > len(chunk) * _CHUNK_ROWS or (harmonics is not None and len(harmonics) != n):
-        extra = "" if harmonics is None else f", {len(harmonics):,} spherical harmonics"
-        raise _unmatched(path, f"its numbers of rows do not match ({n:,} Gaussians, {len(chunk):,} chunks{extra})")
+        extra = "" if harmonics is None else f", spherical harmonics: {len(harmonics):,}"
+        raise _unmatched(path, f"its numbers of rows do not match (Gaussians: {n:,}, chunks: {len(chunk):,}{extra})")
     words = {name: torch.from_numpy(vertex[name].astype(np.int64)) for name in _VERTEX}
     rotation, color = words["packed_rotation"], _units(words["packed_color"], (8, 8, 8, 8))
     means, scales = (_bounds(chunk, group, n) for group in ("means", "scales"))
@@ -143,10 +143,7 @@ def _check_element(path: Path, element: str, table: np.ndarray | None, names: tu
     types = {} if table is None else {name: table.dtype[name] for name in table.dtype.names or ()}
     wrong = [name for name in names if name not in types or types[name].kind != kind]
     if len(wrong) > 0:
-        raise InputError(
-            f"{path} is a compressed PLY file, but its element {element!r} has no valid {', '.join(wrong)}. Write the "
-            "file again, or give the uncompressed PLY file."
-        )
+        raise _unmatched(path, f"properties of the element {element!r} are missing or not valid ({', '.join(wrong)})")
 
 
 def _unmatched(path: Path, problem: str) -> InputError:

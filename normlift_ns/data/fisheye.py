@@ -20,7 +20,7 @@ The share is smaller only if too many pixels lie beyond `MAX_ANGLE`.
 """
 MAX_ANGLE = math.radians(80)
 """Largest angle to the optical axis, in radians, of the pixels that count as kept. A pinhole camera cannot show
-directions near 90 degrees."""
+directions near 90 degrees. Pixels that the distortion model does not reach count as beyond this angle."""
 _MIN_SHARE = 0.1
 """Minimum share of pixels within `MAX_ANGLE`. If the share is smaller, the distortion is probably wrong."""
 _SAMPLES, _SAMPLING_ERROR = 512, 1e-3
@@ -66,7 +66,7 @@ def _pinhole(lens: Intrinsics) -> _Pinhole:
             f"{[*lens[6:9], lens.k4]}) lie within {math.degrees(MAX_ANGLE):.0f} degrees of the optical axis, expected "
             f"at least {_MIN_SHARE:.0%}. The focal length or the distortion is probably wrong. Correct them, or "
             "undistort the images to a smaller angle, for example with colmap image_undistorter, and give the new "
-            "images and cameras"
+            "images and cameras."
         )
     lost = int((1 - KEPT_SHARE - _SAMPLING_ERROR) * len(limits))
     factor = np.partition(limits, lost)[lost] or limits[is_seen].min()

@@ -57,8 +57,8 @@ def read_image_header(file: Path) -> ImageHeader:
         ) from error
     if format_ not in _FORMATS or max(size) > _MAX_SIDE or min(size) < 1:
         raise InputError(
-            f"{file} cannot be read as an image: it is a {format_} of {size[0]} x {size[1]} pixels. Expected JPEG, "
-            f"PNG, WebP, TIFF or BMP with at most {_MAX_SIDE:,} pixels along a side."
+            f"{file} cannot be read as an image: its format is {format_}, and its size is {size[0]} x {size[1]} "
+            f"pixels. Expected JPEG, PNG, WebP, TIFF or BMP with at most {_MAX_SIDE:,} pixels along a side."
         )
     return ImageHeader(size, mode, rotated, multi_frame)
 
@@ -135,7 +135,7 @@ PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """Fisheye camera models that `Intrinsics` can represent, by their names in COLMAP."""
 _SMALLEST = 1e-12
-"""Distortion parameter k1 that replaces 0 in fisheye cameras, and is too small to move any pixel.
+"""Distortion parameter k1 of fisheye cameras without distortion, too small to move any pixel.
 
 nerfstudio treats fisheye cameras without distortion as pinhole cameras.
 """
@@ -310,7 +310,7 @@ def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Pat
 
 
 def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
-    """Return the first existing file of `possible_paths`, or None. Its suffix may be another one or an added one."""
+    """Return the first existing file of `possible_paths`, or None. It may have another or an additional suffix."""
     for candidate in possible_paths(folder, name, copies=copies):
         for file in (
             *(candidate.with_name(candidate.name + suffix) for suffix in ("", *_SUFFIXES)),
@@ -335,8 +335,7 @@ def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
         mask = _find_file(folder, f"{name}.png", copies=True) or _find_file(folder, name, copies=True)
         if mask is None:
             raise FileNotFoundError(
-                f"{folder} has no mask for {name}. Expected {Path(name).name}.png or {Path(name).stem}.png for "
-                "every image."
+                f"{folder} has no mask for {name}. Expected {Path(name).stem}.png, and a mask for every other image."
             )
         masks.append(mask.absolute())
     check_files_distinct(zip(names, masks), "mask", "in folders named like those of the images")

@@ -313,13 +313,13 @@ def _find_accessor(gltf: _Gltf, index: int, name: str, size: int) -> tuple[_Acce
     accessor = accessors[index] if 0 <= index < len(accessors) else None
     if accessor is not None and (accessor.sparse is not None or accessor.buffer_view is None):
         raise InputError(
-            f"{gltf.path} has {name} in a sparse accessor, expected a dense one. Export it without sparse accessors, "
-            "or as a PLY file."
+            f"{gltf.path} has {name} in an accessor that is sparse or has no data, expected a dense one. Export the "
+            "splat without sparse accessors, or as a PLY file."
         )
     kind = None if accessor is None else _TYPES.get(accessor.component_type)
     if accessor is None or kind is None or _SIZES.get(accessor.type) != size:
         raise _damaged(
-            gltf.path, f"the accessor of {name} is missing, or its type is not valid (numbers per row: {size})"
+            gltf.path, f"the accessor of {name} is missing, or its type is not valid (expected numbers per row: {size})"
         )
     return accessor, kind
 

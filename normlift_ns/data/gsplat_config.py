@@ -65,13 +65,13 @@ def _parse(path: Path) -> yaml.Node | None:
     try:
         return yaml.compose(read_text(path), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
-        raise InputError(f"{path} is not valid YAML ({describe_yaml_error(error)}). {_ADVICE}") from error
+        raise InputError(f"{path} cannot be read as YAML ({describe_yaml_error(error)}). {_ADVICE}") from error
 
 
 def _test_every(path: Path, root: yaml.Node | None) -> int | None:
     text = config_string(root, "test_every")
-    if text is not None and not (text.isdecimal() and 0 < int(text) < 10**9):
-        raise InputError(f"{path} has test_every {text[:40]!r}, expected a whole number above 0. {_ADVICE}")
+    if text is not None and not (text.isdecimal() and 1 < int(text) < 10**9):
+        raise InputError(f"{path} has test_every {text[:40]!r}, expected a whole number above 1. {_ADVICE}")
     return None if text is None else int(text)
 
 
@@ -99,14 +99,15 @@ def _primitive(path: Path, root: yaml.Node | None) -> Primitive | None:
     model_type, camera_model = config_string(root, "model_type"), config_string(root, "camera_model")
     of_3dgut = [name for name in _OF_3DGUT if _flag(path, root, name)]
     if len(of_3dgut) > 0:
-        problem = f"{of_3dgut[0]} true (3DGUT), which renders Gaussians differently"
+        problem = f"{of_3dgut[0]}: true (3DGUT), which renders Gaussians differently"
     elif model_type not in (None, "3dgs", "2dgs"):
-        problem = f"model_type {model_type[:40]}, which renders Gaussians differently"
+        problem = f"model_type: {model_type[:40]}, which renders Gaussians differently"
     elif camera_model not in (None, "pinhole"):
-        problem = f"camera_model {camera_model[:40]}"
+        problem = f"camera_model: {camera_model[:40]}"
     else:
         return cast("Primitive | None", model_type)
     raise InputError(
-        f"According to {path}, the splat was trained with {problem}. Expected 3D or 2D Gaussians and pinhole cameras. "
-        "Train the scene again with simple_trainer.py or simple_trainer_2dgs.py and undistorted images."
+        f"According to {path}, the splat was trained with the setting {problem}. Expected 3D or 2D Gaussians "
+        "and pinhole cameras. Train the scene again with simple_trainer.py or simple_trainer_2dgs.py and undistorted "
+        "images."
     )

@@ -33,7 +33,7 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, eval_images:
         eval_images: Image names with or without folder and suffix, a text file with one name per line, or the fraction
             of held-out images. For a fraction, the training images are evenly spaced, as in ns-train's data parser.
     Raises:
-        ValueError: A name does not match exactly one image, a value is invalid, or both options are given.
+        ValueError: A name matches no image or several images, a value is invalid, or both options are given.
     """
     if test_every is not None and len(eval_images) > 0:
         raise InputError("--test-every and --eval-images cannot be combined; omit one of them")
@@ -62,7 +62,7 @@ def _fraction(eval_images: Sequence[str]) -> float | None:
         return None  # an image name
     if not 0 < fraction < 1:
         raise InputError(
-            f"--eval-images {eval_images[0]} is not a valid fraction; give a number between 0 and 1, or image names"
+            f"--eval-images {eval_images[0]} is not a valid fraction; give a number above 0 and below 1, or image names"
         )
     return fraction
 
@@ -88,7 +88,8 @@ def _matching(requested: str, names: Sequence[str]) -> list[str]:
         matches = [name for name in names if str(short(Path(name))) == str(path)]
         if len(matches) > 1:
             raise InputError(
-                f"--eval-images {requested} matches {len(matches)} images: {', '.join(matches)}. Give the full name."
+                f"--eval-images {requested} matches {len(matches)} images; the first two are {matches[0]} and "
+                f"{matches[1]}. Give the full name."
             )
         if matches:
             return matches
@@ -192,7 +193,7 @@ class SplitViews:
         if mask.shape != image.shape[:2]:
             raise InputError(
                 f"the mask has shape {mask.shape}, but must have one channel and the size of the image, "
-                f"{image.shape[:2]}; save it in grayscale"
+                f"{image.shape[:2]}; save it in grayscale and in this size"
             )
         return image, mask
 
@@ -233,10 +234,11 @@ class SplitViews:
             raise IndexError(f"view {index} does not exist; the number of views is {len(self)}")
         index %= len(self)
         distorted, distorted_mask = self._read(index)
+        camera = self.cameras[index]  # its errors give the path of the image
         image, mask, was_distorted = self._undistort(index, distorted, distorted_mask)
         original_size = (distorted.shape[1], distorted.shape[0]) if was_distorted else None
         image = blend_background(image, self._background)
-        return View(self.cameras[index], image, mask, self.names[index], original_size)
+        return View(camera, image, mask, self.names[index], original_size)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -266,10 +268,10 @@ class SplitViews:
         return image_warnings(self.files, headers)
 
     def _check_size(self, index: int, size: Sequence[int]) -> None:
-        expected = self._sizes[index]
+        expected, scaled = self._sizes[index], "" if self._scale == 1 else f" (scaled by {self._scale:g})"
         if list(size) != list(expected):
             raise InputError(
-                f"{self.files[index]} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
+                f"{self.files[index]}{scaled} is {size[0]} x {size[1]} pixels, but its camera has {expected[0]} x "
                 f"{expected[1]} (width x height). Use the images that the {self._TRAINED} was trained with."
             )
 
@@ -356,8 +358,8 @@ def _mode_problem(mode: str) -> str | None:
     if mode[0] not in "IF":
         return None
     return (
-        f"its pixel format is {mode}, expected 8 bits per channel; give the images that the splat was trained with, or "
-        "convert them in the same way"
+        f"its pixel format is {mode}, expected 8 bits per channel; give 8-bit images, converted in the same way as for "
+        "the training"
     )
 
 

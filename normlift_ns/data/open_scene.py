@@ -160,7 +160,7 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
     try:
         saved = msgspec.convert(read_json_file(path, _EXPECTED), _Saved)
         if any(text.strip() == "" or "\0" in text for text in (saved.name, saved.photographs)):
-            raise msgspec.ValidationError("the value of name or photographs is empty")
+            raise msgspec.ValidationError("name or photographs is empty or contains a null character")
     except msgspec.ValidationError as error:
         raise InputError(f"{path} does not match the schema: {error}. Expected {_EXPECTED}.") from error
     checkpoint = read_checkpoint(find_checkpoint(run_dir / CHECKPOINT_DIR, load_step))
@@ -171,7 +171,7 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
         run_dir / TRANSFORMS_FILE,
         None if data is None else data.absolute(),
         base=Path(saved.photographs),
-        advice="give their folder with --data" if data is None else "lift again without them",
+        advice="give their folder with --data" if data is None else "lift the splat again without them",
     )
     check_frames(cameras.frames, run_dir / TRANSFORMS_FILE)
     train, held_out = split_views(cameras.frames, cameras.held_out, saved.background)
@@ -243,7 +243,7 @@ def add_stored_images(scene: NerfstudioScene, run_dir: Path) -> NerfstudioScene:
     path = run_dir / EXTRA_IMAGES_FILE
     if not path.is_file():
         return scene
-    added = read_transforms(path, base=scene.location.folder, advice="put them back, or lift without --add-images")
+    added = read_transforms(path, base=scene.location.folder, advice="lift the original run again without --add-images")
     check_frames(added.frames, path)
     return with_frames(scene, added.frames)
 
@@ -349,6 +349,5 @@ def _changed_cameras(field: SemanticField, scene: Scene) -> list[str]:
         return []
     return [
         f"The {' and '.join(changed)} cameras of {scene.name} have changed since the lift. Query results still use the "
-        "old cameras, but renders and evaluations use the new ones. Restore the dataset, give its path with --data, or "
-        "lift again."
+        "old cameras, but renders and evaluations use the new ones. Restore the cameras of the lift, or lift again."
     ]

@@ -115,12 +115,17 @@ def open_splat(
     else:
         scene = find_world(candidates, scene_in, device=choose_device(device), say=say)
     positions = np.array([frame.pose[:, 3] for frame in (*scene.train.frames, *scene.held_out.frames)])
-    _check_coordinates(file.splat, positions, f"The cameras of {cameras.source}", options)
+    _check_coordinates(file.splat, positions, f"The cameras of {cameras.source}", options, of_cameras=True)
     return scene
 
 
 def _check_coordinates(
-    splat: SplatParameters, positions: Float[np.ndarray, "n 3"], what: str, options: SplatOptions
+    splat: SplatParameters,
+    positions: Float[np.ndarray, "n 3"],
+    what: str,
+    options: SplatOptions,
+    *,
+    of_cameras: bool = False,
 ) -> None:
     """Raise InputError if positions are so far from the origin that float32 is too coarse for the Gaussians.
 
@@ -129,19 +134,31 @@ def _check_coordinates(
         positions: Positions of the Gaussians, or of the cameras in the same world.
         what: File or objects with these positions, for the error message.
         options: Options of the splat.
+        of_cameras: True if the positions are those of the cameras, and the splat itself was checked before.
     """
     center, width = np.median(positions, axis=0), float(splat.scales.median().exp())
     step = float(np.spacing(np.abs(center).max().astype(np.float32)))
     if not step > _MAX_STEP * width:
         return
-    x, y, z = (float(f"{value:.2g}") for value in center)
-    matrix = f"1 0 0 {-x:.0f}\\n0 1 0 {-y:.0f}\\n0 0 1 {-z:.0f}\\n0 0 0 1\\n"
-    place = f" For the cameras, run printf '{matrix}' > offset.txt, and give --world-transform offset.txt."
+    x, y, z = (round(float(f"{value:.2g}")) for value in center)
+    matrix = f"1 0 0 {-x}\\n0 1 0 {-y}\\n0 0 1 {-z}\\n0 0 0 1\\n"
+    command = f"run printf '{matrix}' > offset.txt, and give --world-transform offset.txt"
+    given = options.world_transform if isinstance(options.world_transform, Path) else None
+    if of_cameras:
+        advice = (
+            f"Subtract the offset that was subtracted from the splat. For the offset {x} {y} {z}, {command}."
+            if given is None
+            else f"Correct the transform in {given}."
+        )
+    else:
+        advice = (
+            f"Subtract the same offset, such as {x} {y} {z}, from the splat and the cameras. Export the splat with "
+            "this offset from the program that wrote it. For the cameras, "
+            f"{command if given is None else f'change the transform in {given}'}."
+        )
     raise InputError(
         f"{what}: the median of the coordinates is ({', '.join(f'{value:.10g}' for value in center)}), far from the "
-        f"origin. There, the step of float32 is {step:.2g}, too coarse for Gaussians {width:.2g} wide. Subtract the "
-        f"same offset, such as {x:.0f} {y:.0f} {z:.0f}, from the splat and the cameras. Export the splat with this "
-        f"offset from the program that wrote it.{'' if isinstance(options.world_transform, Path) else place}"
+        f"origin. There, the step of float32 is {step:.2g}, too coarse for Gaussians {width:.2g} wide. {advice}"
     )
 
 
@@ -335,8 +352,8 @@ def _refuse_archive(path: Path) -> None:
         raise _unread(path, "SOG")
     if not any(Path(name).name == "data.pkl" for name in names):  # torch.save writes data.pkl
         raise InputError(
-            f"{path} is a ZIP archive of {', '.join(names)[:200] or 'nothing'}, expected a splat. Extract the splat, "
-            "and give the extracted file."
+            f"{path} is a ZIP archive of {', '.join(names)[:200] or 'nothing'}, expected a splat. If the archive "
+            "contains a splat, extract it, and give the extracted file."
         )
 
 
@@ -344,7 +361,7 @@ def _unread(path: Path, name: str) -> InputError:
     advice = "Export a PLY file from the program that wrote it, and give the PLY file."
     if name in _BY_SPLAT_TRANSFORM:
         advice = f"Convert it with: npx @playcanvas/splat-transform {path.name} {path.stem}.ply (Node 22 or newer)"
-    return InputError(f"{path} is a {name} file, which is not supported. {advice}")
+    return InputError(f"{path} has the format {name}, which is not supported. {advice}")
 
 
 def _assumptions(
@@ -369,7 +386,10 @@ def _assumptions(
         lifted = "lifted too" if options.views == "all" else "not lifted"
         texts.append(f"Images held out of the training are {lifted} ({len(held_out)} of {len(frames)} images).")
     else:
-        texts.append(f"All images are lifted ({len(frames)}); to hold out some, give --test-every or --eval-images.")
+        texts.append(
+            f"No images are held out (number of images: {len(frames)}); to hold out some, give --test-every or "
+            "--eval-images."
+        )
     texts += cameras.remarks
     if frames[0].intrinsics.fisheye:
         texts.append(_fisheye_assumption(frames[0]))
@@ -388,7 +408,7 @@ def _fisheye_assumption(frame: Frame) -> str:
     except InputError as error:
         raise InputError(f"The camera of {frame.file} cannot be used: {error}") from error
     angle = math.degrees(MAX_ANGLE)
-    limit = "" if kept >= KEPT_SHARE else f"; the others lie more than {angle:.0f} degrees from its optical axis"
+    limit = "" if kept >= KEPT_SHARE else f"; the others do not lie within {angle:.0f} degrees of the optical axis"
     return (
         f"Fisheye images are undistorted to pinhole cameras of the same size. {frame.name} keeps {kept:.0%} of its "
         f"pixels{limit}. Masks and label maps are undistorted too: give those of the original images."

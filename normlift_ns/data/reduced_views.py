@@ -59,7 +59,7 @@ class ReducedView(NamedTuple):
         return color.round().to(torch.uint8).expand_as(view.image)
 
     def render(self, scene: Scene, gaussians: GaussianScene, settings: RasterSettings) -> UInt8[Tensor, "h w 3"]:
-        """Render the scene so that it looks like a downscaled render at full size.
+        """Render the scene so that it looks like a full-size render after downscaling.
 
         Args:
             scene: Scene to render.

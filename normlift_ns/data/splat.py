@@ -196,9 +196,9 @@ _OTHER_PRIMITIVES = re.compile(
 )
 """Names of parameters of unsupported primitives; the groups are the keys of `_KINDS`."""
 _KINDS = {
-    "betas": "Beta kernels instead of Gaussians",
-    "shapes": "generalized exponentials instead of Gaussians",
-    "moving": "Gaussians that move",
+    "betas": "Beta kernels",
+    "shapes": "generalized exponentials",
+    "moving": "moving Gaussians",
     "networks": "Gaussians that a network generates",
 }
 _UNUSED = ("nx", "ny", "nz", "red", "green", "blue")
@@ -214,8 +214,8 @@ def check_extra_names(names: Iterable[str], file: Path) -> tuple[str, ...]:
     names = list(names)
     for match in filter(None, map(_OTHER_PRIMITIVES.fullmatch, names)):
         raise InputError(
-            f"{file} has {match[0]}, a parameter of {_KINDS[match.lastgroup or '']}, which are not supported. Export "
-            "3D Gaussians from the program that wrote the file, and give the new file with --load-ply."
+            f"{file} has the parameter {match[0]}, but {_KINDS[match.lastgroup or '']} are not supported. Export 3D "
+            "Gaussians from the program that wrote the file, and give the new file with --load-ply."
         )
     if len(names) == 0:
         return ()
@@ -251,10 +251,8 @@ def read_ply(path: Path) -> SplatFile:
     data = _parse_ply(path)
     vertex = next((element for element in data.elements if element.name == "vertex"), None)
     if vertex is None or vertex.count == 0:
-        found = ", ".join(f"{element.count:,} {element.name}" for element in data.elements)[:200] or "nothing"
-        raise InputError(
-            f"{path} has no Gaussians (numbers of its elements: {found}). Give the PLY file of a trained splat."
-        )
+        found = ", ".join(f"{element.count:,} {element.name}" for element in data.elements)[:200] or "none"
+        raise InputError(f"{path} has no Gaussians (its elements: {found}). Give the PLY file of a trained splat.")
     mode = _mode([*data.comments, *vertex.comments])
     if any(item.name == PACKED for item in vertex.properties):
         parameters, rounding = unpack_compressed_ply(data, path)
@@ -282,7 +280,7 @@ def _remarks(path: Path, vertex: PlyElement, rest: list[str], modes: list[str]) 
     remarks = check_extra_names([item.name for item in vertex.properties if item.name not in known], path)
     unknown = [name for name in modes if name.lower() not in _MODES]
     if len(unknown) > 0:
-        remarks += (f"{path.name} has the unknown SplatRenderMode {unknown[0][:40]}; give --rasterize-mode.",)
+        remarks += (f"{path.name} has the unknown SplatRenderMode {unknown[0][:40]}, which is ignored.",)
     return remarks
 
 
@@ -362,7 +360,7 @@ def _check_properties(path: Path, vertex: PlyElement) -> bool:
         )
     lists = [item.name for item in vertex.properties if item.name in required and hasattr(item, "len_dtype")]
     if lists:
-        raise InputError(f"{path} is not a splat: {', '.join(lists)} are lists, expected one number per Gaussian.")
+        raise InputError(f"{path} is not a splat: expected one number per Gaussian, found lists ({', '.join(lists)}).")
     return is_2d
 
 
@@ -389,9 +387,10 @@ def check_ply_header(path: Path) -> None:
         words, properties = lines[start], sum(other[:1] == [b"property"] for other in lines[start:end])
         count = words[2] if len(words) == 3 else b""
         if not count.isdigit() or len(count) > 18 or (properties == 0 and int(count) > 0):
+            text = b" ".join(words)[:80].decode("latin1")
             raise InputError(
-                f"{path} is truncated or damaged: its header has the line {b' '.join(words)[:80]!r} (number of "
-                f"properties: {properties}). Expected a complete PLY file; copy it again."
+                f"{path} is truncated or damaged: its header has the line {text!r} (number of properties: "
+                f"{properties}). Expected a complete PLY file; copy it again."
             )
         declared += int(count) * properties  # each property takes at least one byte
     if declared > size:

@@ -137,7 +137,7 @@ def decode_spz(data: bytes, path: Path) -> SplatFile:
     if header.flags & _HAS_EXTENSIONS:
         remarks.append(
             f"{path.name} has extensions, such as the name of its coordinate system, which are not applied. If the "
-            "cameras are in another system, give --world-transform."
+            "cameras are in another system, give a file with --world-transform."
         )
     return SplatFile(splat, "antialiased" if header.flags & _ANTIALIASED else None, remarks=tuple(remarks))
 
@@ -156,7 +156,7 @@ def _read_header(data: bytes, path: Path) -> _Header:
         raise _damaged(path, f"its header ends after {len(data)} of {_HEADER.size} bytes")
     if not data.startswith(SPZ_MAGIC):
         raise InputError(
-            f"{path} is not an SPZ file: it begins with {data[:4].hex()}, expected {SPZ_MAGIC.hex()}. If "
+            f"{path} is not an SPZ file: its content begins with {data[:4].hex()}, expected {SPZ_MAGIC.hex()}. If "
             "it is a compressed file of a different kind, decompress it first, for example with gunzip."
         )
     _, version, count, degree, fractional_bits, flags, _ = _HEADER.unpack_from(data)
@@ -174,9 +174,9 @@ def _read_header(data: bytes, path: Path) -> _Header:
     return _Header(version, count, degree, fractional_bits, flags)
 
 
-def _check_size(header: _Header, size: int, path: Path) -> None:
+def _check_size(header: _Header, size: int, path: Path, max_ratio: int = _MAX_RATIO) -> None:
     """Raise if a compressed file of `size` bytes is too small for the Gaussians, or if they do not fit into memory."""
-    if sum(header.sizes) > size * _MAX_RATIO:
+    if sum(header.sizes) > size * max_ratio:
         raise _damaged(path, f"its header declares {header.gaussians:,} Gaussians, too many for {size:,} bytes")
     refuse_small_memory(header.gaussians)
 
@@ -215,7 +215,7 @@ def _read_zstd(data: bytes, path: Path) -> tuple[_Header, list[bytes]]:
         raise _damaged(path, f"it is not compressed as a whole, as in version 4, but has version {header.version}")
     if len(data) < _TABLE_OFFSET.size:
         raise _damaged(path, f"it ends after {len(data)} of {_TABLE_OFFSET.size} header bytes")
-    _check_size(header, len(data) * 64, path)  # zstd can reach a higher compression ratio than deflate
+    _check_size(header, len(data), path, 64 * _MAX_RATIO)  # zstd can reach a higher compression ratio than deflate
     (start,), number = _TABLE_OFFSET.unpack_from(data), data[_HEADER.size - 1]
     sizes = [size for size in header.sizes if size > 0]
     offset = start + number * _TABLE_ENTRY.size

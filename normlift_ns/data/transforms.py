@@ -129,7 +129,7 @@ def read_json_file(path: Path, expected: str) -> Any:
         return msgspec.json.decode(text)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         invalid = next((word for word in ("NaN", "Infinity") if word.encode() in text), None)
-        reason = str(error) if invalid is None else f"it contains {invalid}"
+        reason = str(error) if invalid is None else f"{error}; JSON does not allow {invalid}"
         raise InputError(f"{path} is not valid JSON ({reason}). Expected {expected}.") from error
 
 
@@ -179,7 +179,7 @@ def _check_numbers(entry: CameraEntry, source: str) -> None:
         raise InputError(f"{source}: w x h is {entry.w:g} x {entry.h:g}, expected at most {_MAX_PIXELS:,} pixels.")
     for name, focal in _given(entry, "fl_x", "fl_y"):
         if not 0 < focal < _MAX_VALUE:
-            raise InputError(f"{source}: {name} is {focal:g}, expected a positive number of pixels.")
+            raise InputError(f"{source}: {name} is {focal:g}, expected a number of pixels above 0 and below 1e30.")
     parameters = [(f"distortion_params[{i}]", value) for i, value in enumerate(entry.distortion_params or ())]
     for name, value in (*_given(entry, "cx", "cy", *DISTORTION), *parameters):
         if not abs(value) < _MAX_VALUE:
@@ -264,7 +264,7 @@ def read_transforms(
 
 
 def _held_out(entries: TransformsEntries, root: Path, path: Path) -> list[bool]:
-    """Return True for each frame that the file excludes from the training.
+    """Return a list with True for each frame that the file excludes from the training.
 
     As in nerfstudio, a list must not contain files without a frame.
     """
@@ -313,7 +313,7 @@ def _listed_masks(entries: TransformsEntries, root: Path, images: Path | None, p
     if missing:
         raise FileNotFoundError(
             f"Masks of {path} are missing ({len(missing)} of {len(names)}, the first is {root / missing[0]}). Copy "
-            "them to these paths, or give their folder with --masks."
+            "them to these paths. For a new lift of a splat, you can instead give their folder with --masks."
         )
     return [file.absolute() for file in files if file is not None]
 
@@ -367,7 +367,7 @@ def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrins
         raise InputError(
             f"{path} is contradictory. For {frame.file_path}, {name} is {first[1]:g} from {first[0]}, which "
             f"nerfstudio reads, and {second[1]:g} from {second[0]}, which programs such as instant-ngp and Brush read. "
-            f"Remove the values that the splat was not trained with, and give new.json with --transforms: "
+            f"Remove the values that the splat was not trained with, and give new.json instead: "
             f"jq 'del({others})' {path.name} > new.json, or jq 'del({kept})' {path.name} > new.json"
         )
 
@@ -484,7 +484,7 @@ def _applied_transform(entries: TransformsEntries, path: Path) -> Float[np.ndarr
     matrix = np.eye(4)
     if rows is not None:
         if not _is_matrix(rows, math.inf):
-            raise InputError(f"{path}: applied_transform is not valid, expected 3 x 4 finite numbers.")
+            raise InputError(f"{path}: applied_transform is not valid, expected 3 x 4 or 4 x 4 finite numbers.")
         matrix[:3] = rows[:3]
     if abs(np.linalg.det(matrix)) < _MIN_DETERMINANT or not 0 < entries.applied_scale < math.inf:
         is_singular = abs(np.linalg.det(matrix)) < _MIN_DETERMINANT
@@ -519,7 +519,7 @@ def _entry(frame: Frame) -> dict[str, Any]:
 _TOLERANCE = 1e-3
 """Maximum deviation of a matrix from a similarity; numbers in files are rounded."""
 _MAX_MATRIX_BYTES = 2**16
-_EXPECTED_DATAPARSER = "the dataparser_transforms.json that ns-train wrote; copy it again from the run"
+_EXPECTED_DATAPARSER = "the dataparser_transforms.json of a run; copy it again"
 _EXPECTED_MATRIX = "4 x 4 numbers in JSON, .npy or .txt, or the dataparser_transforms.json of a nerfstudio run"
 
 
@@ -669,8 +669,8 @@ def gsplat_normalization(frames: Sequence[Frame], points: Float[np.ndarray, "n 3
     if not np.isfinite(upright).all():
         raise InputError(
             "gsplat's normalization cannot be computed from these cameras: all are at one point, or their up axes "
-            "cancel out. Give --world-transform. If the training used --no-normalize-world-space, give "
-            "--gsplat-normalize False."
+            "cancel out. Give the transform as a file with --world-transform. If the training used "
+            "--no-normalize-world-space, give --gsplat-normalize False."
         )
     if np.linalg.det(upright[:3, :3]) < 0:
         raise InputError(
@@ -681,7 +681,7 @@ def gsplat_normalization(frames: Sequence[Frame], points: Float[np.ndarray, "n 3
     height = _apply(aligned, points.astype(np.float32))[:, 2]
     if np.median(height) > np.mean(height):
         aligned = np.diag([1.0, -1, -1, 1]) @ aligned
-    return decompose_similarity(aligned, "the normalization")
+    return decompose_similarity(aligned, "The normalization by gsplat's trainer")
 
 
 def _apply(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -720,7 +720,7 @@ def _principal_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"
     if not np.isfinite(covariance).all():
         raise InputError(
             "gsplat's normalization cannot be computed, because the points of the COLMAP project are too far away. "
-            "Give --world-transform."
+            "Give the transform as a file with --world-transform."
         )
     axes = np.linalg.eigh(covariance)[1][:, ::-1].copy()
     if np.linalg.det(axes) < 0:

@@ -277,7 +277,7 @@ def find_world(
     device: str,
     say: Callable[[str], None],
 ) -> SplatScene:
-    """Search for the world in which renders of the scene reach the usual PSNR, and return the scene in this world.
+    """Search for the world in which renders of the scene fit the images, and return the scene in this world.
 
     If the first world fits, no other world is tried. Otherwise, the result is the scene in the only other world that
     fits, or in the first world if none or several fit.

@@ -61,7 +61,7 @@ class CandidateWorld(NamedTuple):
     def scaled(self, scale: float) -> CandidateWorld:
         """Return the world, scaled uniformly about its origin."""
         return self._replace(
-            name=f"{self.name} and a scale of {scale:g}",
+            name=f"{self.name}, scaled by {scale:g}",
             world=self.world._replace(scale=self.world.scale * scale),
             scale_since_training=self.scale_since_training * scale,
         )
@@ -129,8 +129,8 @@ def _gsplat_world(options: SplatOptions, cameras: CameraFile) -> CandidateWorld:
     if options.colmap is None:
         raise InputError(
             "gsplat's trainer normalized the world of the splat with the points of its COLMAP project, so a "
-            "transforms.json is not enough. Give the project with --colmap, or a known transform with "
-            "--world-transform, or --gsplat-normalize False if the training used --no-normalize-world-space."
+            "transforms.json is not enough. Give the project with --colmap, or a file of a known transform with "
+            "--world-transform. If the training used --no-normalize-world-space, give --gsplat-normalize False."
         )
     try:
         points = read_colmap_points(cameras.source)
@@ -155,7 +155,7 @@ def _applied_worlds(cameras: CameraFile) -> Iterator[CandidateWorld]:
     except InputError:
         return
     yield CandidateWorld("the world before applied_transform", before)
-    yield CandidateWorld("the world after another applied_transform", after)
+    yield CandidateWorld("the world after a second applied_transform", after)
 
 
 def _ns_train_worlds(options: SplatOptions, cameras: CameraFile) -> Iterator[CandidateWorld]:

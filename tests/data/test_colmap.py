@@ -68,7 +68,7 @@ def test_the_project_is_found_where_it_lies(tmp_path: Path) -> None:
         there = shutil.copytree(found, tmp_path / place)
         assert find_colmap_model(tmp_path / place[0]) == there
     (tmp_path / "b").mkdir()
-    for name, message in (("b", "COLMAP"), ("c", "does not exist")):
+    for name, message in (("b", "COLMAP"), ("c", "not an existing folder")):
         with pytest.raises(FileNotFoundError, match=message):
             find_colmap_model(tmp_path / name)
 
@@ -81,7 +81,7 @@ def test_the_largest_of_several_reconstructions_is_read(tmp_path: Path) -> None:
     said: list[str] = []
     for folder in (tmp_path / "p", tmp_path / "p" / "sparse"):
         assert find_colmap_model(folder, said.append) == tmp_path / "p" / "sparse" / "1"
-        assert all(part in said[-1] for part in ("0 (images: 2)", "1 (images: 5)", "10 (images: 3)", "--colmap"))
+        assert all(part in said[-1] for part in ("0 (images: 2)", "1 (images: 5)", "10 (images: 3)", "give its folder"))
     assert find_colmap_model(tmp_path / "p" / "sparse" / "0", said.append).name == "0"
     (tmp_path / "p" / "sparse" / "1" / "images.txt").write_text("damaged")
     assert find_colmap_model(tmp_path / "p").name == "10"

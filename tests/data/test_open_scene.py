@@ -243,13 +243,13 @@ def test_what_does_not_fit_is_refused(native, splat, frames, tmp_path: Path, mon
     every = {"colmap": "p", "images": str(images)}
     for options, message in (
         ({"images": "."}, "camera file, got none"),
-        ({"colmap": "p", "images": "none"}, "folder none, given with --images"),
+        ({"colmap": "p", "images": "none"}, "none, given with --images"),
         ({"colmap": "p"}, "folder .*p/images"),
         ({"colmap": "p", "images": "half"}, "half .*13 of 14,"),
         ({"colmap": "p", "images": "flat"}, "160 x 60 .* aspect"),
         ({"colmap": "empty", "images": "half"}, "cameras: 0, registered images: 0"),
         ({**every, "test_every": 8, "eval_images": ("0001",)}, "test-every and --eval-images"),
-        ({**every, "eval_images": ("1.5",)}, r"1\.5 .* between 0 and 1"),
+        ({**every, "eval_images": ("1.5",)}, r"1\.5 .* above 0 and below 1"),
         ({**every, "eval_images": ("list.txt",)}, r"list\.txt"),
         ({**every, "eval_images": ("cat",)}, "--eval-images .*cat"),
         ({**every, "masks": "masks"}, r"masks has no mask for .*0000\.png"),

@@ -156,7 +156,7 @@ def test_other_content_is_refused(tmp_path: Path) -> None:
         (INTRINSICS, {"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix of images/b.png .* 4 x 4"),
         (INTRINSICS, {"transform_matrix": np.diag([2, 2, 2, 1]).tolist()}, "pose of images/a.png .* rotation"),
         (INTRINSICS, {"transform_matrix": np.diag([-1, 1, 1, 1])[:3].tolist()}, "rotation"),
-        ({**INTRINSICS, "fl_x": -5.0}, {}, "fl_x is -5, .*positive"),
+        ({**INTRINSICS, "fl_x": -5.0}, {}, "fl_x is -5, .*above 0"),
     ):
         path = capture(tmp_path, content, **frame)
         with pytest.raises(InputError, match=message) as caught:

@@ -28,8 +28,8 @@ TURNS = {
     "from y up to z up": QUARTER.T,
     "from z up to y up": QUARTER,
     "after an exchange of x and y": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
-    "and a scale of 2.5": 2.5 * np.eye(3),
-    "from y up to z up and a scale of 100": 100 * QUARTER.T,
+    ", scaled by 2.5": 2.5 * np.eye(3),
+    "from y up to z up, scaled by 100": 100 * QUARTER.T,
 }
 
 
@@ -123,7 +123,7 @@ def test_applied_transform_is_found_either_way(native, splat, transforms, tmp_pa
     transforms.write_text(json.dumps(content))
     matrix = np.vstack([applied, [0, 0, 0, 1]])
     _, said = opened(tmp_path, in_world(splat, np.linalg.inv(matrix) if inverse else matrix), transforms)
-    assert ("before applied_transform" if inverse else "after another applied_transform") in said[0]
+    assert ("before applied_transform" if inverse else "after a second applied_transform") in said[0]
 
 
 @pytest.mark.slow
@@ -165,7 +165,7 @@ def test_a_splat_opened_again_is_in_the_very_same_world(splat, transforms, tmp_p
 
 @needs_shared
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "turn"), [("fox", "after half a turn about z"), ("tabletop", "and a scale of 2.5")])
+@pytest.mark.parametrize(("name", "turn"), [("fox", "after half a turn about z"), ("tabletop", ", scaled by 2.5")])
 def test_worlds_of_real_captures_are_found(name: str, turn: str, tmp_path: Path) -> None:
     scene = capture(name)
     cameras = read_transforms(SHARED / "captures" / name)

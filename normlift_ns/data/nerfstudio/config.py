@@ -35,7 +35,7 @@ from normlift_ns.options import LiftOptions, RefineConfig, short_repr
 OBJECT_TAG = "tag:yaml.org,2002:python/object"
 _MAX_BYTES = 2**18
 """Maximum size of a config.yml in bytes. Configs of nerfstudio have about 6,000 bytes."""
-_EXPECTED = "With --load-config, give the config.yml that ns-train splatfacto wrote."
+_EXPECTED = "With --load-config, give the config.yml that ns-train or ns-normlift wrote."
 
 
 def check_config_exists(path: Path, wrote: str = "ns-train") -> None:
@@ -259,7 +259,8 @@ CONFIG_TARGETS: dict[str, str | None] = {
     else CLASS_TARGETS.get(cls)
     for name, cls in CONFIG_CLASSES.items()
 }
-"""Name of the class that each configuration class instantiates, keyed by the name of the configuration class."""
+"""Name of the class or function that each configuration class instantiates, keyed by the name of the configuration
+class; None if there is none."""
 _TARGETS = {target for target in CONFIG_TARGETS.values() if target is not None}
 _TARGET = "_target"
 """Field of a config.yml with the class or function that a configuration class instantiates.
@@ -323,7 +324,7 @@ def _construct_object(loader: ConfigLoader, name: str, node: yaml.Node) -> Any:
     known = {field.name: field for field in fields(cls)}
     stored = values.pop(_TARGET, None if target is None else _Name(target))
     if target is not None and not (isinstance(stored, _Name) and stored.name == target):
-        stored_name = stored.name.rpartition(".")[2] if isinstance(stored, _Name) else type(stored).__name__
+        stored_name = stored.name if isinstance(stored, _Name) else type(stored).__name__
         raise _error(f"the _target of {name} is {stored_name}, expected {target}", node)
     if hasattr(config, "__setstate__"):
         config.__setstate__(values)  # renames the fields of version 0.1
@@ -424,15 +425,15 @@ _NOTHING = (None, False, 0, "", "off", "none", "default")
 
 
 def export_advice(path: Path) -> str:
-    """Return advice with commands that lift the Gaussians of a run with an unsupported config or dataset.
+    """Return a sentence with commands that lift the Gaussians of a run with an unsupported config or dataset.
 
     Args:
         path: Path of the config.yml of the run.
     """
     return (
-        f"Export its Gaussians with: ns-export gaussian-splat --load-config {path} --output-dir exports, and lift them "
-        "with: ns-normlift --load-ply exports/splat.ply --transforms transforms.json (or --colmap PROJECT) "
-        f"--world-transform {path.parent / 'dataparser_transforms.json'}"
+        "If the run has standard Gaussians, export them with: ns-export gaussian-splat --load-config "
+        f"{path} --output-dir exports, and lift them with: ns-normlift --load-ply exports/splat.ply --transforms "
+        f"transforms.json (or --colmap PROJECT) --world-transform {path.parent / 'dataparser_transforms.json'}"
     )
 
 
@@ -479,9 +480,9 @@ def check_components(config: Any, path: Path) -> None:
         full_name = CONFIG_CLASS_NAMES.get(cls, f"{cls.__module__}.{cls.__qualname__}")
         if cls.__name__ not in classes or full_name not in CONFIG_TARGETS:
             raise InputError(
-                f"{path} has the method {str(config.method_name)!r}, but its {name} is a {cls.__name__}, expected "
+                f"{path} has the method {str(config.method_name)!r}, but its {name} is {full_name}, expected "
                 f"{' or '.join(classes)}. Only stock splatfacto runs can be lifted. "
-                f"If the run has standard Gaussians: {export_advice(path)}"
+                f"{export_advice(path)}"
             )
 
 
@@ -633,8 +634,7 @@ def read_trainer_config(path: Path, say: Callable[[str], None] = lambda text: No
     if method not in SUPPORTED_METHODS:
         raise InputError(
             f"{path} has the method {method!r}, expected one of {', '.join(SUPPORTED_METHODS)}. "
-            "Train the capture with: ns-train splatfacto --data DATASET. If the run has standard Gaussians instead: "
-            f"{export_advice(path)}"
+            f"Train the capture with: ns-train splatfacto --data DATASET. {export_advice(path)}"
         )
     loader = ConfigLoader("")
     try:
@@ -649,7 +649,7 @@ def read_trainer_config(path: Path, say: Callable[[str], None] = lambda text: No
         if cls in _CLASSES_OF_DRAWN and _DRAWN.search(name) and value not in _NOTHING:
             raise InputError(
                 f"{path}: {cls} has the unknown setting {name}: {_format(value)}, which may affect rendering. "
-                f"If the run has standard Gaussians: {export_advice(path)}"
+                f"{export_advice(path)}"
             )
     if len(loader.unknown) > 0:
         names = ", ".join(f"{cls}.{name}" for cls, name, _ in loader.unknown)

@@ -26,7 +26,7 @@ from normlift_ns.data.transforms import (
     read_transforms_entries,
     relative_name,
 )
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, summarize_error
 from normlift_ns.io.guard import check_files_distinct, read_text
 
 _PARALLEL_TOLERANCE, _MIN_TILT = 1e-6, 0.17
@@ -277,7 +277,7 @@ def split_files(
     """Return the indices of the training images and of the evaluation images.
 
     The lists of the dataset take precedence over eval_mode. The evaluation images are those of the test list, or of the
-    validation list if there is no test list. Without these two lists, there are none.
+    validation list if there is no test list. If there is only a training list, there are no evaluation images.
 
     Raises:
         ValueError: There are lists, but no list of training images, or a listed file is missing. Also if eval_mode is
@@ -358,9 +358,10 @@ def parse_dataset(datamanager: config_classes.FullImageDatamanagerConfig, *, dat
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:  # pyrefly: ignore[unreachable-except-clause]
         if isinstance(error, InputError) and str(parser.data) in str(error):
             raise InputError(f"{str(error).removesuffix('.')}. {advice}") from error
+        reason = str(error) if isinstance(error, InputError) else summarize_error(error)
         raise InputError(
-            f"nerfstudio cannot read the dataset {parser.data} ({type(error).__name__}: {error}). Expected the dataset "
-            f"that the run was trained on. {advice}"
+            f"nerfstudio cannot read the dataset {parser.data} ({reason}). Expected the dataset of the "
+            f"training. {advice}"
         ) from error
     scale = datamanager.camera_res_scale_factor
     return replace(dataset, train=dataset.train.resized(scale), held_out=dataset.held_out.resized(scale))

@@ -74,7 +74,7 @@ class TrainedViews(SplitViews):
         distortion = [] if self._split.distortion is None else self._split.distortion[index].tolist()
         needed = _NUM_DISTORTION[kind]
         if any(distortion) and len(distortion) < needed:
-            raise InputError(f"the distortion {distortion} cannot be removed (expected {needed} parameters)")
+            raise InputError(f"the distortion {distortion} cannot be removed (expected at least {needed} parameters)")
         k1, k2, k3, k4, p1, p2 = [*distortion, *[0.0] * 6][:6]
         fx, fy, cx, cy = self._split.intrinsics[index].tolist()
         width, height = self._sizes[index]
@@ -141,7 +141,7 @@ class NerfstudioScene:
     """Evaluation views."""
     dataparser_transform: Float[Tensor, "3 4"]
     dataparser_scale: float
-    """Scale of the map from the dataset to the world of the scene: scale * (dataparser_transform @ point)."""
+    """Scale of the map from the capture to the world of the scene: scale * (dataparser_transform @ point)."""
     identity: Mapping[str, Any]
     """Path of the config and step of the checkpoint for the manifest; for lifted runs, also the version of gsplat."""
     remarks: tuple[str, ...] = ()
@@ -240,8 +240,8 @@ def load_nerfstudio_scene(
     gaussians = checkpoint.splat.activated
     if not bool(gaussians.drawable.any()):
         raise InputError(
-            f"{checkpoint.path}: all {len(gaussians):,} Gaussians have NaN or infinite parameters, or zero "
-            "quaternions, so they cannot be rendered. Give another checkpoint with --load-step."
+            f"{checkpoint.path}: all {len(gaussians):,} Gaussians have parameters that are NaN, infinite or too large, "
+            "or zero quaternions, so they cannot be rendered. Give another checkpoint with --load-step."
         )
     dataset = parse_dataset(datamanager, data_given=data is not None)
     advice = "" if data is not None else ", or give the path of the dataset with --data"
@@ -277,7 +277,7 @@ def _check_transform(
     nerfstudio computes the world of the Gaussians from all poses, so a changed dataset leads to another world.
 
     Args:
-        transform, scale: Map from the poses in the dataset to the world of the Gaussians.
+        transform, scale: Map from the world of the capture to the world of the Gaussians, computed from the dataset.
         location: Paths of the run.
         advice: Alternative to restoring the dataset, for error messages.
     Returns:
@@ -294,9 +294,9 @@ def _check_transform(
     is_close = gap <= _TRANSFORM_TOLERANCE and abs(scale / trained.scale - 1) <= _TRANSFORM_TOLERANCE
     if not is_close:  # or NaN
         raise InputError(
-            f"The dataset {location.data} has changed since the training of {location.run_dir}: frames were added, "
-            f"removed or moved. Its poses give scale {scale:.6g}, but {file.name} has {trained.scale:.6g}, and the "
-            f"numbers of the transforms differ by up to {gap:.3g}. Restore the camera file of the dataset{advice}."
+            f"The cameras of the dataset {location.data} are not those of the training of {location.run_dir}. Their "
+            f"poses give the scale {scale:.6g}, and {file.name} has {trained.scale:.6g}; the numbers of the transforms "
+            f"differ by up to {gap:.3g}. Restore the camera file of the dataset{advice}."
         )
     return ()
 
