@@ -372,6 +372,8 @@ def _convert_union(name: str, value: Any, choices: Sequence[Any]) -> Any:
     others = [choice for choice in choices if get_origin(choice) is not Literal and choice is not type(None)]
     if len(others) == 0:  # Rule | Literal["auto"]
         return _check_choice(name, value, words)
+    if isinstance(value, str) and len(words) > 0 and others[0] is float and value not in words:
+        raise _error(name, f"a number or {' or '.join(words)}", value)
     return value if isinstance(value, str) and value in words else _convert(name, value, others[0])
 
 

@@ -282,7 +282,7 @@ def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
         for name, value in array(task + 4, 3, least=4).items():
             monkeypatch.setenv(name, value)
         assert run_entry(monkeypatch, batch.entrypoint, made.list) == 0
-        assert f"5 captures in {made.list}, {2 if task < 2 else 1} of them in part {task + 1} of 3" in said(capsys)
+        assert f"5 captures in {made.list} ({2 if task < 2 else 1} in part {task + 1} of 3)" in said(capsys)
     lines = read_jsonl(made.results, batch.Outcome)
     assert len(lines) == len({line.key for line in lines}) == 5
     assert len(list(made.results.glob("*.jsonl"))) == 3

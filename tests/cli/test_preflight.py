@@ -87,7 +87,7 @@ SPLATS = [
     ("--load-gsplat fifo", "fifo, given with --load-gsplat", "pipe"),
     ("--load-ply file", "camera file", "none"),
     ("--load-ply file --colmap room --transforms x", "camera file", "two"),
-    ("--load-ply file --transforms dangling", "dangling (a broken link), given with --transforms"),
+    ("--load-ply file --transforms dangling", "dangling, given with --transforms, is a broken link"),
     ("--load-ply file --colmap room --masks none", "none, given with --masks"),
     ("--load-ply file --colmap room --timestamp old", "old exists", "--timestamp"),
     ("--load-config room", "config room is not a file"),
@@ -96,7 +96,7 @@ SPLATS = [
     ("--load-ply file --colmap nowhere", "nowhere, given with --colmap"),
     ("--load-ply file --transforms room --data x", "--data", "--load-config"),
     ("--load-ply file --transforms room --views some", "--views", "'some'"),
-    ("--load-config config.yml --colmap x", "--colmap", "--load-ply and --load-gsplat"),
+    ("--load-config config.yml --colmap x", "--colmap", "--load-ply or --load-gsplat"),
     ("--load-config config.yml --background white", "--background", "--load-ply"),
 ]
 CHECK = [("--output-json mine/answers.json", "answers.json exists", "--output-json", "--overwrite True")]
@@ -175,8 +175,7 @@ VIEW = [
     ("--port 70000", "--port", "65,535", "70000"),
     ("--load-config no.yml", "no.yml"),
     ("--device tpu", "--device", "'tpu'"),
-    ("--host 192.0.2.1", "--host 192.0.2.1"),
-    (f"--host {'a' * 70}", f"--host {'a' * 70}"),
+    *((f"--host {name}", f"--host {name}") for name in ("192.0.2.1", "a" * 70)),
     ("--text-embeddings none.npz", "none.npz, given with --text-embeddings"),
 ]
 SERVE = [("", "No run is given", "ns-normlift-serve RUN/config.yml"), ("nowhere/config.yml", "nowhere/config.yml")]
@@ -227,7 +226,7 @@ def test_a_cache_that_is_a_file_or_a_locked_folder_is_refused_early(config, tmp_
     (tmp_path / "room" / "normlift").mkdir(parents=True)
     (tmp_path / "room" / "normlift" / ".cache").touch()
     (tmp_path / "locked").mkdir(mode=0o500)
-    folders = {tmp_path: ".cache, given with --output-dir", tmp_path / "locked" / "new": "is not writable"}
+    folders = {tmp_path: ".cache, needed for --output-dir", tmp_path / "locked" / "new": "is not writable"}
     for folder, fact in list(folders.items())[: 1 if os.geteuid() == 0 else 2]:  # root may write everywhere
         assert run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *COLOUR, "--output-dir", folder) == 1
         assert fact in said(capsys)
