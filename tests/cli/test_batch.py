@@ -354,7 +354,7 @@ def test_what_the_environment_says_and_cannot_say():
         ({"RANK": "x", "WORLD_SIZE": "2"}, "RANK", "at least 0", "'x'"),
         ({"RANK": "0", "WORLD_SIZE": "0"}, "WORLD_SIZE", "at least 1", "'0'"),
         ({"SLURM_ARRAY_TASK_ID": "1"}, "SLURM_ARRAY_TASK_ID is set", "SLURM_ARRAY_TASK_COUNT is not"),
-        (array(7, 3, least=1), "SLURM_ARRAY_TASK_ID is 7", "COUNT (3)", "MIN (1)"),
+        (array(7, 3, least=1), "SLURM_ARRAY_TASK_ID is 7", "COUNT is 3", "MIN is 1"),
         (array(3, 2, least=0, step=2), "without gaps"),
         (array(0, 2, least=1), "without gaps"),
     ):
