@@ -381,7 +381,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     statistics = manifest["statistics"]
     storage = manifest["form"]
     table = Table.grid(Column(), Column(overflow="fold"), padding=(0, 2))
-    unseen = f"{statistics['zero_evidence_share']:.1%} are not visible in any image, or only outside all regions"
+    unseen = f"{statistics['zero_evidence_share']:.1%} are visible in no image, or only outside of regions"
     table.add_row("Gaussians", f"{statistics['gaussians']:,}; {unseen}")
     if statistics["excluded"] > 0:
         table.add_row("not rendered", f"{statistics['excluded']:,} with non-finite or out-of-range parameters")
