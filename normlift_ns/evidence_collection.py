@@ -409,7 +409,8 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     Args:
         views: The same view at every size that the label map may have.
     Raises:
-        ValueError: The map has the wrong size. If the source resamples maps, the function warns instead.
+        ValueError: The map has the wrong size. If the source resamples maps, the function warns instead. It also warns
+            if undistortion did not change the size, because the size then proves nothing.
     """
     original_size, name = views[0].original, views[0].name
     maps = source.regions if isinstance(source, RegionFeatures) else source

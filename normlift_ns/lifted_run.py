@@ -593,8 +593,8 @@ class LiftedRun:
 
 def _no_image(name: str, names: Sequence[str]) -> MissingImageError:
     return MissingImageError(
-        f"view must be the name of a training image ({names[0]} to {names[-1]}) or an index in 0..{len(names) - 1}, got "
-        f"{name}"
+        f"view must be the name of a training image ({names[0]} to {names[-1]}) or an index in 0..{len(names) - 1}, "
+        f"got {name}"
     )
 
 

@@ -322,7 +322,8 @@ class Outcome:
     message: str
     """Reason for the failure; empty if the attempt did not fail."""
     code: int
-    """Exit code of the process, or 128 plus the number of the signal that killed it."""
+    """Exit code of the process, or 128 plus the number of the signal that killed it. Without a process, 1 for a failure,
+    else 0."""
     run: str | None
     """Directory of the lifted run; None if the attempt failed or the directory is not known."""
     worker: str
@@ -376,7 +377,8 @@ _GRACE = 30.0
 def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], interval: float) -> int | None:
     """Run a program and write its output to a log file.
 
-    On Linux, the program always ends with this process. On other systems, it ends after Ctrl-C and SIGTERM only.
+    On Linux, the program always ends with this process. On other systems, it ends only if Ctrl-C or SIGTERM ends this
+    process.
 
     Args:
         command: Command line of the program.
@@ -537,7 +539,7 @@ class NormLiftBatch(CheckedOptions):
         """Lift the captures and print the results.
 
         Raises:
-            SystemExit: A capture failed. The exit code is the largest exit code of all captures.
+            SystemExit: A capture of this worker failed. The exit code is the largest one of its captures.
         """
         check_readable_file(self.captures, "ns-normlift-batch")
         shard = make_shard(self.shard, os.environ)
