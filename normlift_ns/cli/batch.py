@@ -322,8 +322,8 @@ class Outcome:
     message: str
     """Reason for the failure; empty if the attempt did not fail."""
     code: int
-    """0 unless the attempt failed. For a failed process, its exit code, or 128 plus the number of the signal that killed
-    it. 1 if the attempt failed before a process started."""
+    """0 unless the attempt failed. For a failed process, its exit code, or 128 plus the number of the signal that
+    killed it. For a damaged run directory, 1."""
     run: str | None
     """Directory of the lifted run; None if the attempt failed or the directory is not known."""
     worker: str
