@@ -428,7 +428,7 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
                 f"label map {file} of {name} {mismatch}. Make the label maps from the undistorted images, or give "
                 f"{option_setting('regions_resample', True)} and accept that the maps may not fit the images exactly"
             )
-        warnings.warn(f"label map {file} {mismatch}. It is resized, and may not fit the image exactly", stacklevel=2)
+        warnings.warn(f"label map {file} {mismatch}. The map is resized and may not fit exactly", stacklevel=2)
     elif (width, height) == original_size:
         warnings.warn(
             "the training undistorted the images without changing their size. Make sure that the label maps in "
