@@ -19,7 +19,7 @@ class InputError(ValueError):
 
     The message names the file or argument, what was found, what was expected and what to do. Missing files raise
     `FileNotFoundError` instead, files that cannot be written raise `OSError`, and full memory raises `MemoryError`.
-    The docstring of `describe_error` lists all exceptions that are not internal errors.
+    The docstring of `describe_error` lists the kinds of user errors.
 
     >>> from normlift_ns import InputError, LiftOptions
     >>> try:
@@ -81,7 +81,7 @@ def truncate_text(text: str, max_length: int = 40) -> str:
 def summarize_error(error: BaseException) -> str:
     """Return the type and the first line of another package's error, to quote in a message.
 
-    If the first line ends with a colon, the second line follows. Longer texts are cut after 300 characters.
+    If the first line ends with a colon, the second line follows. The result is cut after 300 characters.
     """
     lines = [line.strip() for line in str(error).strip().splitlines()]
     lines = lines[: 2 if len(lines) > 0 and lines[0].endswith(":") else 1]
@@ -119,7 +119,7 @@ def _user_message(error: BaseException) -> str | None:
         return f"{error.filename}: {error.strerror}" if named else error.strerror or str(error)
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
         own = str(error) if type(error) is MemoryError else ""
-        advice = "close other programs; for a lift, use --max-views or --lift-downscale 2"
+        advice = "close other programs, or, for a lift, increase --lift-downscale or reduce --max-views"
         return own or f"the memory is full; {advice}"
     if type(error).__name__ == "OutOfMemoryError":  # torch's class, without importing torch
         return f"the GPU's memory is full ({_first_line(error)}); use the CPU: --device cpu"

@@ -35,7 +35,7 @@ from normlift_ns.encoders.base import (
 from normlift_ns.encoders.cache import CachedRegions, cached
 from normlift_ns.errors import InputError
 from normlift_ns.io.arrays import read_metadata
-from normlift_ns.options import BackendName, LiftOptions, RasterizeMode, option_name
+from normlift_ns.options import BackendName, LiftOptions, RasterizeMode, option_name, option_setting
 from normlift_ns.rasterization.rasterize import rasterize_evidence, render_image
 from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.segmentation.regions import LabelFiles
@@ -304,8 +304,8 @@ def _check_sizes(view: View) -> None:
     for name, size in (("image", view.image.shape[:2]), ("mask", expected if view.mask is None else view.mask.shape)):
         if tuple(size) != expected:
             raise InputError(
-                f"the {name} of {view.name} is {tuple(size)}, but its camera is {expected} (height x width); give an "
-                "image, a mask and a camera of the same size"
+                f"the {name} of {view.name} is {tuple(size)}, but its camera is {expected} (height x width); images, "
+                "masks and cameras must have the same size"
             )
 
 
@@ -409,7 +409,8 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     Args:
         views: The same view at every size that the label map may have.
     Raises:
-        ValueError: The map has the wrong size. If the source resamples maps, the function warns instead.
+        ValueError: The map has the wrong size. If the source resamples maps, the function warns instead. It also warns
+            if undistortion did not change the size, because the size then proves nothing.
     """
     original_size, name = views[0].original, views[0].name
     maps = source.regions if isinstance(source, RegionFeatures) else source
@@ -419,19 +420,19 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     file, width, height = maps.size(name)
     sizes = [(view.camera.width, view.camera.height) for view in views]
     if (width, height) not in sizes:
-        kind = "the size of the original image" if (width, height) == original_size else "a different size"
-        to_size = f"training undistorted the image to {sizes[0][0]}x{sizes[0][1]}"
-        mismatch = f"is {width}x{height} (width x height), {kind}; {to_size}"
+        kind = ", the size of the original image" if (width, height) == original_size else ""
+        to_size = f"the training undistorted the image to {sizes[0][0]}x{sizes[0][1]}"
+        mismatch = f"is {width}x{height} (width x height){kind}; {to_size}"
         if not maps.resample:
             raise InputError(
                 f"label map {file} of {name} {mismatch}. Make the label maps from the undistorted images, or give "
-                "--regions-resample True and accept an error of a few pixels"
+                f"{option_setting('regions_resample', True)} and accept that the maps may not fit the images exactly"
             )
-        warnings.warn(f"label map {file} {mismatch}. The map is resized, and may be off by a few pixels", stacklevel=2)
+        warnings.warn(f"label map {file} {mismatch}. The map is resized and may not fit exactly", stacklevel=2)
     elif (width, height) == original_size:
         warnings.warn(
-            f"training undistorted images without changing their size. Make sure that the label maps in {file.parent} "
-            "were made from the undistorted images",
+            "the training undistorted the images without changing their size. Make sure that the label maps in "
+            f"{file.parent} were made from the undistorted images",
             stacklevel=2,
         )
 

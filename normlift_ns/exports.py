@@ -185,7 +185,7 @@ def write_splat(
     columns = splat.columns()
     rows = exportable_rows(columns, keep)
     if len(rows) == 0:
-        raise InputError(f"{path} is not written: {_reason_for_no_rows(int(keep.sum()))}")
+        raise InputError(f"{path} is not written because {_reason_for_no_rows(int(keep.sum()))}")
     if labels.answer is not None and labels.instances is None:
         labels = labels._replace(instances=answer_instances(labels.answer))
     kind = file_format or _named_format(path)
@@ -214,10 +214,10 @@ def write_splat(
 
 
 def _reason_for_no_rows(selected: int) -> str:
-    """Return the reason why none of the selected Gaussians can be written, with advice."""
+    """Return the reason why no Gaussian of a selection, which may be the whole scene, can be written, with advice."""
     if selected == 0:
-        return "no Gaussian is selected; select at least one"
-    subject = "the only selected Gaussian is" if selected == 1 else f"all {selected:,} selected Gaussians are"
+        return "it would contain no Gaussian; change the selection"
+    subject = "the only Gaussian to write is" if selected == 1 else f"all {selected:,} Gaussians to write are"
     return f"{subject} invisible (opacity below 1/255, or parameters that are not finite); select visible Gaussians"
 
 
@@ -313,7 +313,7 @@ def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
         for draft, ids in zip(drafts[1:3], (instances.class_id, instances.instance_id)):
             np.save(draft, ids.cpu().numpy()[job.rows].astype(np.int32) - 1)
         drafts[3].write_text(json.dumps(names, indent=2) + "\n", "utf8")
-    return [f"Labels of {len(job.rows):,} Gaussians in {folder}"]
+    return [f"Labels in {folder} (number of Gaussians: {len(job.rows):,})"]
 
 
 class CloudTransfer(NamedTuple):
@@ -393,7 +393,10 @@ def check_no_properties(cloud: PlyData, names: Iterable[str]) -> None:
     """Raise ValueError if the vertices of a cloud already have properties of these names."""
     existing = sorted(set(cloud["vertex"].data.dtype.names or ()) & set(names))
     if len(existing) > 0:
-        raise InputError(f"the vertices of the cloud already have {', '.join(existing)}; remove these properties first")
+        raise InputError(
+            f"the vertices of the cloud already have properties with names of labels ({', '.join(existing)}); give a "
+            "cloud without such properties"
+        )
 
 
 def vertex_positions(cloud: PlyData) -> Float64[np.ndarray, "p 3"]:
@@ -545,8 +548,8 @@ def _export_cloud(job: ExportJob, path: Path) -> list[str]:
     assert job.answer is not None and job.instances is not None
     cloud = (job.transfer, path)
     labeled = transfer_labels(job.scene, job.field, job.answer, job.instances, *cloud, overwrite=job.overwrite)
-    within = f"{labeled.share:.1%} of them within {labeled.limit:.3g} of a Gaussian"
-    return [f"{labeled.points:,} points in {path}, {within}"]
+    points = f"{labeled.points:,} point{'s' * (labeled.points != 1)}"
+    return [f"{points} in {path}, {labeled.share:.1%} within {labeled.limit:.3g} of a Gaussian"]
 
 
 PLY = Exporter(_export_splat, ".ply", needs_answer=False)

@@ -593,7 +593,8 @@ class LiftedRun:
 
 def _no_image(name: str, names: Sequence[str]) -> MissingImageError:
     return MissingImageError(
-        f"view must be a training image, got {name}; give one of the {len(names)} images {names[0]} to {names[-1]}"
+        f"view must be the name of a training image ({names[0]} to {names[-1]}) or an index in 0..{len(names) - 1}, "
+        f"got {name}"
     )
 
 
@@ -650,8 +651,8 @@ def write_run(
     """Write a lifted run, completely or not at all, and return its directory.
 
     The directory contains config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model,
-    without optimizers), dataparser_transforms.json, and the field in normlift/. A run lifted from a PLY file or gsplat
-    checkpoint also has its cameras in transforms.json, and the other settings that reopen it in splat.json.
+    without optimizers), dataparser_transforms.json, and the field in normlift/. A run without a nerfstudio source run
+    also has its cameras in transforms.json, and the other settings that reopen it in splat.json.
 
     Relative paths in the config of the source run stay relative. nerfstudio's own commands must therefore run in the
     directory in which the source run was trained. The ns-normlift commands run in any directory.
@@ -727,7 +728,7 @@ def _lifted_config(source: NerfstudioScene, run_dir: Path) -> config_classes.Tra
 
 
 def splat_config(scene: SplatScene, run_dir: Path) -> config_classes.TrainerConfig:
-    """Return a nerfstudio config for a run lifted from a PLY file or gsplat checkpoint, which has no config of its own.
+    """Return a nerfstudio config for a lift of a splat file or gsplat checkpoint, which has no config of its own.
 
     With this config, nerfstudio loads the cameras in the run directory without transforming them. All paths
     outside the run directory are absolute, because the run has no training directory as a base for relative paths.

@@ -372,7 +372,11 @@ def _convert_union(name: str, value: Any, choices: Sequence[Any]) -> Any:
     others = [choice for choice in choices if get_origin(choice) is not Literal and choice is not type(None)]
     if len(others) == 0:  # Rule | Literal["auto"]
         return _check_choice(name, value, words)
-    return value if isinstance(value, str) and value in words else _convert(name, value, others[0])
+    if isinstance(value, str) and value in words:
+        return value
+    if len(words) > 0 and others[0] is float and not isinstance(value, Real):
+        raise _error(name, f"a number or {' or '.join(words)}", value)
+    return _convert(name, value, others[0])
 
 
 def _convert_scalar(name: str, value: Any, hint: type) -> Any:

@@ -80,6 +80,7 @@ from normlift_ns.options import (
     check_bool,
     check_path,
     check_prompt_list,
+    option_name,
     renamed,
 )
 from normlift_ns.progress import ProgressCallback, StageTimer, lift_cost
@@ -397,8 +398,9 @@ def query_to_store(
     length = source.text(queries).shape[1]
     if length != field.dimension:
         raise InputError(
-            f"the vectors of --queries have {length} numbers, but the features have {field.dimension}; give the model "
-            "of the features with --encoder-model and --encoder-pretrained, or give --text-embeddings"
+            f"the vectors of {option_name('queries')} have {length} numbers, but the features have {field.dimension}; "
+            f"give the model of the features with {option_name('encoder_model')} and "
+            f"{option_name('encoder_pretrained')}, or vectors of that model with {option_name('text_embeddings')}"
         )
     negatives = None
     if isinstance(source, PrecomputedFeatures):  # the file with these prompts does not exist yet
@@ -649,18 +651,17 @@ def check_directions(counts: Int64[Tensor, " 2"], total: int, source: FeatureSou
         raise InputError(
             f"nothing was labeled: no pixel that shows any of the {total:,} Gaussians belongs to a region (from "
             f"{_describe(source)}). Check these likely causes: all label values are negative or the background "
-            "(--regions-background), the level has no regions (--level), masks exclude all pixels, all features are "
-            "zero, or the cameras do not face the scene"
+            f"({option_name('regions_background')}), the level has no regions ({option_name('level')}), masks exclude "
+            "all pixels, all features are zero, or the cameras do not face the scene"
         )
     if lifted == 0:
         raise InputError(
             f"none of the {total:,} Gaussians received a direction, although some of them appear in regions (from "
-            f"{_describe(source)}). Check whether the features cancel out in every Gaussian. If unlabeled pixels "
-            "outweigh the regions, give --unlabeled ignore"
+            f"{_describe(source)}). Check whether the features of the regions cancel out in every Gaussian"
         )
     if lifted < _MIN_LIFTED_SHARE * total:
         warnings.warn(
-            f"only {lifted:,} of {total:,} Gaussians ({lifted / total:.2%}) appear in labeled pixels; the others have "
+            f"only {lifted:,} of {total:,} Gaussians ({lifted / total:.2%}) received a direction; the others have "
             f"no features. If this is not intended, check the regions (from {_describe(source)}) and the cameras",
             stacklevel=2,
         )

@@ -332,7 +332,7 @@ _FEW_IN_VIEW, _NONE_IN_VIEW = 0.5, 0.001
 """Shares of Gaussians in view below which the check warns, and below which it fails."""
 _HIGH_SHARE = 0.8
 """An estimate gets a warning if it takes more than this share of the free memory or disk space."""
-_LIFT_LESS = "reduce the lift with --lift-downscale 2 or --max-views 50"
+_LIFT_LESS = "increase --lift-downscale, reduce --max-views"
 _SHOWN_PACKAGES = ("torch", "numpy", "nerfstudio", "gsplat", "open_clip_torch")
 
 
@@ -357,7 +357,8 @@ def diagnose_views(scene: Scene) -> Diagnostic:
     share = float(visible.float().mean())
     message = f"{share:.1%} of the Gaussians are in at least one training view (number of views: {len(scene.train)})"
     if share < _NONE_IN_VIEW:
-        return Diagnostic("in view", "error", message, "give the cameras of this splat, or add --world-transform FILE")
+        advice = "check the cameras and, with --load-ply or --load-gsplat, --world-transform"
+        return Diagnostic("in view", "error", message, advice)
     if share < _FEW_IN_VIEW:
         advice = "check that these are the cameras of the splat; the other Gaussians get no semantics"
         return Diagnostic("in view", "warning", message, advice)
@@ -396,7 +397,7 @@ def diagnose_recognition(run_dirs: Iterable[Path]) -> list[Diagnostic]:
         if (run_dir / FIELD_FOLDER / MANIFEST_FILE).is_file():
             facts = read_manifest(run_dir / FIELD_FOLDER)[0].get("statistics", {}).get("recognition")
             if facts is None:
-                advice = "lift again to measure how well regions are recognized in left-out views"
+                advice = "lift with --recognition True to measure how well regions are recognized in left-out views"
                 return [Diagnostic("lifted run", "ok", str(run_dir), advice)]
             return [Diagnostic("lifted run", "ok", describe_recognition(facts))]
     return []
@@ -410,7 +411,7 @@ def diagnose_device(device: str) -> Diagnostic:
         return Diagnostic("device", "ok", f"{name}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free")
     message = f"CPU (threads: {torch.get_num_threads()}); no GPU is used"
     if torch.cuda.is_available():
-        return Diagnostic("device", "warning", f"{message}, although one is available", "add --device cuda")
+        return Diagnostic("device", "warning", f"{message}, although one is available", "give --device cuda")
     return Diagnostic("device", "ok", message)
 
 
@@ -489,10 +490,10 @@ def diagnose_memory(plan: Plan, device: str) -> list[Diagnostic]:
     free = min(free_memory().values(), default=None)
     if free is not None:
         own = int((peak_gib() or 0.0) * 2**30)
-        rows.append(_check_capacity("memory", plan.host_bytes, free + own, f"free memory, or {_LIFT_LESS}"))
+        rows.append(_check_capacity("memory", plan.host_bytes, free + own, f"{_LIFT_LESS}, or free memory"))
     if plan.device_bytes is not None:
         free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)
-        rows.append(_check_capacity("GPU memory", plan.device_bytes, free, f"{_LIFT_LESS}, or add --device cpu"))
+        rows.append(_check_capacity("GPU memory", plan.device_bytes, free, f"{_LIFT_LESS}, or give --device cpu"))
     return rows
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import torch
 
+from normlift_ns.options import option_setting
+
 ProgressCallback = Callable[[str, int, int], None]
 """Progress callback, called with (stage, steps done, total steps)."""
 
@@ -45,9 +47,8 @@ class StageTimer:
         try:
             yield step
         except torch.cuda.OutOfMemoryError as error:
-            raise MemoryError(
-                f"the GPU's memory is full in stage {stage} ({error}); lift on the CPU: --device cpu"
-            ) from error
+            advice = f"lift on the CPU: {option_setting('device', 'cpu')}"
+            raise MemoryError(f"the GPU's memory is full in stage {stage} ({error}); {advice}") from error
         if torch.cuda.is_available():
             torch.cuda.synchronize()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + self._clock() - start

@@ -53,8 +53,8 @@ class Registry(Generic[Plugin]):
             plugin = point.load()
         except (Exception, SystemExit) as error:  # importing a third-party module may raise anything
             raise InputError(
-                f"{self.noun} {name!r} of {_package(point)} cannot be loaded ({summarize_error(error)}); repair or "
-                f"uninstall that package, or use another {self.noun}, {advice}"
+                f"{self.noun} {name!r} of {_package(point)} cannot be loaded ({summarize_error(error)}); repair "
+                f"that package, or use another {self.noun}, {advice}"
             ) from error
         if not isinstance(plugin, self.plugin):
             raise InputError(

@@ -67,7 +67,7 @@ FULL = np.ones((HEIGHT, WIDTH), int)
 
 def test_nothing_labelled_is_refused_and_few_gaussians_with_features_are_warned_of(tmp_path: Path) -> None:
     for value, unlabeled in ((0, "ignore"), (-5, "dilute")):
-        with pytest.raises(nl.InputError, match=r"nothing was labeled: .* 30 .*maps.*--regions-back"):
+        with pytest.raises(nl.InputError, match=r"nothing was labeled: .* 30 .*maps.*regions_back"):
             lifted(files(tmp_path / "maps", value * FULL), tmp_path / "cache", unlabeled=unlabeled)
     hidden, away = scene(mask=torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)), scene()
     away.gaussians.means[:] -= 100
@@ -120,7 +120,7 @@ def test_maps_of_distorted_images_are_refused_or_stretched(tmp_path: Path) -> No
     """Also where another size of the same image is: half of 25 x 19 is half of 24 x 18, but for the distortion."""
     for height, width, what in (
         (HEIGHT + 1, WIDTH + 1, "the size of the original image"),
-        (HEIGHT // 2, WIDTH // 2, "a different size"),
+        (HEIGHT // 2, WIDTH // 2, "width x height\\)"),
     ):
         for kind in ("langsplat", "files"):
             refused, stretched = (
@@ -130,7 +130,7 @@ def test_maps_of_distorted_images_are_refused_or_stretched(tmp_path: Path) -> No
                 for resample in (False, True)
             )
             message = rf"{kind}\S+ (of images/a\.png )?is {width}x{height} .*{what}; "
-            with pytest.raises(nl.InputError, match=message + r".*24x18\. .*--regions-resample True"):
+            with pytest.raises(nl.InputError, match=message + r".*24x18\. .*regions_resample=True"):
                 lifted(refused, tmp_path / "cache", scene(original=RAW))
             with pytest.warns(UserWarning, match=message + ".*resized"):
                 lifted(stretched, tmp_path / "cache", scene(original=RAW))

@@ -75,7 +75,7 @@ def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
     try:
         common = _parse(options)
     except InputError as error:
-        raise InputError(f"Invalid options after --. {error}") from None
+        raise InputError(f"Options after --: {error}") from None
     if (name := next((name for name in _SOURCE_NAMES if getattr(common, name) is not None), None)) is not None:
         raise InputError(
             f"--{name.replace('_', '-')} is given after --, but options there apply to every capture. Write this "
@@ -252,8 +252,8 @@ def make_shard(word: str, environment: Mapping[str, str]) -> Shard:
     match = re.fullmatch(r"(\d{1,7})/(\d{1,7})", word, re.ASCII)
     if match is None or not 1 <= int(match[1]) <= int(match[2]) <= _MAX_SHARDS:
         raise InputError(
-            f"--shard must be auto, none, or i/n for the i-th of n parts, from 1/n to n/n, got {short_repr(word)}. For "
-            "example, give --shard 2/4 to the second of four workers."
+            f"--shard must be auto, none, or i/n for the i-th of n parts, where 1 <= i <= n <= {_MAX_SHARDS:,}, got "
+            f"{short_repr(word)}. For example, give --shard 2/4 to the second of four workers."
         )
     return Shard(int(match[1]) - 1, int(match[2]))
 
@@ -268,9 +268,9 @@ def _slurm_shard(environment: Mapping[str, str]) -> Shard:
     index, remainder = divmod(task - first, step)
     if remainder != 0 or not 0 <= index < count:
         raise InputError(
-            f"{_TASK_ID} is {task}, which contradicts {_TASK_COUNT} ({count}) and {_TASK_MIN} ({first}) in an array "
-            "without gaps. Submit an array without gaps, such as sbatch -a 0-7, or give --shard none to let workers "
-            "claim captures in a shared folder."
+            f"{_TASK_ID} is {task}, but an array without gaps has no such task if {_TASK_COUNT} is {count}, "
+            f"{_TASK_MIN} is {first} and {_TASK_STEP} is {step}. Submit an array without gaps, such as sbatch -a 0-7, "
+            "or give --shard none to let workers claim captures in a shared folder."
         )
     return Shard(index, count)
 
@@ -292,8 +292,8 @@ def _integer(environment: Mapping[str, str], name: str, least: int, default: str
     text = environment.get(name, default)
     if not re.fullmatch(r"\d{1,7}", text, re.ASCII) or int(text) < least:
         raise InputError(
-            f"{name} must be a whole number, at least {least}, got {short_repr(text)}. Correct it, or give the part "
-            "with --shard i/n."
+            f"{name} must be a whole number, at least {least} and at most 9,999,999, got {short_repr(text)}. Correct "
+            "it, or give the part with --shard i/n."
         )
     return int(text)
 
@@ -323,7 +323,8 @@ class Outcome:
     message: str
     """Reason for the failure; empty if the attempt did not fail."""
     code: int
-    """Exit code of the process, or 128 plus the number of the signal that killed it."""
+    """0 unless the attempt failed. For a failed process, its exit code, or 128 plus the number of the signal that
+    killed it. For a damaged run directory, 1."""
     run: str | None
     """Directory of the lifted run; None if the attempt failed or the directory is not known."""
     worker: str
@@ -377,7 +378,8 @@ _GRACE = 30.0
 def run_logged(command: Sequence[str], log: Path, on_tick: Callable[[], bool], interval: float) -> int | None:
     """Run a program and write its output to a log file.
 
-    On Linux, the program always ends with this process. On other systems, it ends after Ctrl-C and SIGTERM only.
+    On Linux, the program always ends with this process. On other systems, it ends only if Ctrl-C or SIGTERM ends this
+    process.
 
     Args:
         command: Command line of the program.
@@ -528,7 +530,7 @@ class NormLiftBatch(CheckedOptions):
     as captures_batch for captures.txt."""
     shard: str = "auto"
     """Part of the list that this worker lifts. i/n: the i-th of n parts. none: all captures that no other worker has
-    claimed. auto: the part that the variables of a SLURM job array, or RANK and WORLD_SIZE,
+    claimed. auto: the part that the variables of a Slurm job array, or RANK and WORLD_SIZE,
     define; without these variables, the same as none."""
     patience: float = 120.0
     """Take over another worker's capture after this many seconds without a heartbeat, in 1..86400. Use the same value
@@ -538,7 +540,7 @@ class NormLiftBatch(CheckedOptions):
         """Lift the captures and print the results.
 
         Raises:
-            SystemExit: A capture failed. The exit code is the largest exit code of all captures.
+            SystemExit: A capture of this worker failed. The exit code is the largest one of its captures.
         """
         check_readable_file(self.captures, "ns-normlift-batch")
         shard = make_shard(self.shard, os.environ)
@@ -547,7 +549,7 @@ class NormLiftBatch(CheckedOptions):
         folder = self.results or self.captures.with_name(f"{self.captures.stem}_batch")
         check_writable_folder(folder, "--results")
         count = f"{len(all_captures)} capture{'' if len(all_captures) == 1 else 's'}"
-        part = "" if shard.count == 1 else f", {len(captures)} of them in part {shard.index + 1} of {shard.count}"
+        part = "" if shard.count == 1 else f" ({len(captures)} in part {shard.index + 1} of {shard.count})"
         info(f"{count} in {self.captures}{part}; results, logs and claims in {folder}")
         outcomes = lift_captures(captures, folder, self.patience, on_message=info)
         if len(captures) > 0:

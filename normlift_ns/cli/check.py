@@ -146,7 +146,7 @@ def _show(rows: list[Diagnostic], plan: Plan | None) -> None:
         table.add_row(what, Text(row.state, style=colors[row.state]), found, advice)
     CONSOLE.print(table)
     if plan is None:
-        info("For an estimate of the lift, correct the problems above and rerun the command.")
+        info("For an estimate of the lift, correct each error above and rerun the command.")
     else:
         print_plan(plan)
 

@@ -124,7 +124,7 @@ def split_output_flags(words: Sequence[str]) -> tuple[list[str], OutputSettings]
     """Split a command line into the words without output flags and the output settings.
 
     Raises:
-        InputError: --log-file has no file, or --quiet is neither True nor False.
+        InputError: --log-file has no value, or --quiet is neither True nor False.
 
     >>> split_output_flags(["--vote-k", "8", "--quiet", "--log-file", "a.log"])
     (['--vote-k', '8'], OutputSettings(quiet=True, log_file=PosixPath('a.log')))
@@ -181,12 +181,12 @@ def _open_log(path: Path) -> IO[str]:
         return path.open("a", encoding="utf8", errors="backslashreplace")
     except OSError as error:
         raise InputError(
-            f"{path}, given with --log-file, cannot be written ({error.strerror}); give another file"
+            f"{path}, given with --log-file, cannot be opened ({error.strerror}); give another name"
         ) from error
 
 
 class _OutputStream:
-    """Stream that also writes its output to the log file, without escape sequences."""
+    """Stream that also writes its output to the log file, if there is one, without escape sequences."""
 
     def __init__(
         self, stream: IO[str], log: IO[str] | None, errors: Callable[[], AbstractContextManager[None]]
@@ -209,7 +209,7 @@ class _OutputStream:
 
 @contextmanager
 def _output_errors() -> Iterator[None]:
-    """Raise OutputError if standard output cannot be written."""
+    """Raise OutputError if standard output cannot be written, but pass on errors of a closed pipe."""
     try:
         yield
     except BrokenPipeError:
@@ -278,7 +278,7 @@ def run_command_process(command: type[CommandProtocol]) -> NoReturn:
     """Run a command as the only task of this process, and exit without torch's teardown, which takes a second.
 
     Idle OpenMP threads of torch and of compiled kernels sleep instead of spinning, to leave the cores to other threads
-    and processes. A policy set by the user takes precedence.
+    and processes. A policy that the user set in OMP_WAIT_POLICY takes precedence.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is imported
     _process_starts.append(time.perf_counter() - _process_age())
@@ -332,7 +332,7 @@ def _exit_code(command: type[CommandProtocol], words: list[str]) -> int:
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_USER_ERROR
     except (KeyboardInterrupt, TerminatedError) as stop:
         word, number = "Interrupted" if isinstance(stop, KeyboardInterrupt) else "Terminated", _SIGNALS[type(stop)]
-        print_error(f"{word}. No partial files remain; rerun the command.")
+        print_error(f"{word}. No partial outputs remain; rerun the command.")
         return 128 + number
     except Exception as error:  # print a message instead of a traceback
         return _report_error(error)

@@ -45,7 +45,7 @@ _ASK = AskOptions(threshold="auto")
 class Demo(CheckedOptions):
     """Generate a room with a trained run, lift it with ns-normlift, search it for colors and for an object, and list
     its objects. Two small networks find the objects. The demo downloads their weights (77 MB) once. If this
-    fails, it searches for colors but not for the object."""
+    fails, it only searches for colors."""
 
     folder: Path = Path("demo")
     """Output folder. The demo replaces files of earlier demos."""

@@ -131,7 +131,7 @@ class NormLiftEval(CheckedOptions):
             for option in (option for option in given if given[option] != default[option]):
                 raise InputError(
                     f"--{option.replace('_', '-')} is an option of --protocol {name}, not of {self.protocol}; leave it "
-                    "out, or give that protocol"
+                    f"out, or give --protocol {name}"
                 )
         if self.compare == "paper" and self.protocol not in ("scannet", "lerf"):
             raise InputError(
@@ -147,9 +147,10 @@ class NormLiftEval(CheckedOptions):
                 f"{len(self.labels)}; give one --labels path for each run, in the same order"
             )
         if runs > 1 and (self.protocol == "masks" or self.data is not None):
-            raise InputError("--protocol masks and --data accept only one run; give one path with --load-config")
+            flag = "--data" if self.data is not None else "--protocol masks"
+            raise InputError(f"{flag} works only with a single run; give one path with --load-config")
         if runs > 1 and "coverage" in self.study:
-            raise InputError("--study coverage accepts only one run; give one path with --load-config")
+            raise InputError("--study coverage works only with a single run; give one path with --load-config")
         self._check_files()
 
     def _check_files(self) -> None:

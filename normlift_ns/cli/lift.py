@@ -122,8 +122,8 @@ class NormLift(CheckedOptions):
             cores = os.cpu_count() or 1
             if self.num_devices > cores:
                 common.info(
-                    f"{self.num_devices} processes share {cores} CPU core{'s' * (cores != 1)}. More processes than "
-                    "cores do not make the lift faster."
+                    f"{self.num_devices} processes share {cores} CPU core{'s' * (cores != 1)}. On the CPU, more "
+                    "processes than cores do not make the lift faster."
                 )
             words = common.rename_flags(sys.argv[1:], common.renamed_flags(NormLift))  # prints once
             program = [sys.executable, "-m", "normlift_ns.cli.lift"]
@@ -225,10 +225,10 @@ class NormLift(CheckedOptions):
         if self.load_config is None:
             options, names, needed = self, ("data", "load_step"), "--load-config"
         else:
-            options, names, needed = self.splat, tuple(vars(default)), "--load-ply and --load-gsplat"
+            options, names, needed = self.splat, tuple(vars(default)), "--load-ply or --load-gsplat"
         for name in names:
             if getattr(options, name) != getattr(default, name, None):
-                cure = "Give --images instead." if name == "data" else "Leave it out."
+                cure = "Leave it out; --images sets the folder of the images." if name == "data" else "Leave it out."
                 raise InputError(f"--{name.replace('_', '-')} works only with {needed}. {cure}")
 
     def new_run_location(self) -> tuple[str | None, Path | None]:
@@ -381,7 +381,7 @@ def lift_summary(run: LiftedRun, before: dict[str, float], total: float) -> Grou
     statistics = manifest["statistics"]
     storage = manifest["form"]
     table = Table.grid(Column(), Column(overflow="fold"), padding=(0, 2))
-    unseen = f"{statistics['zero_evidence_share']:.1%} are not visible in any image, or only outside all regions"
+    unseen = f"{statistics['zero_evidence_share']:.1%} are visible in no image, or only outside of regions"
     table.add_row("Gaussians", f"{statistics['gaussians']:,}; {unseen}")
     if statistics["excluded"] > 0:
         table.add_row("not rendered", f"{statistics['excluded']:,} with non-finite or out-of-range parameters")

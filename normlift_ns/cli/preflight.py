@@ -25,21 +25,21 @@ from normlift_ns.options import (
 
 def check_readable_file(path: Path | None, flag: str) -> None:
     """Raise an error if a path does not exist, is not a regular file, or is not readable. Ignore None."""
-    _check_readable(path, flag, "a file", "a file")
+    _check_readable(path, flag, "a file")
 
 
 def check_readable_folder(path: Path | None, flag: str) -> None:
     """Raise an error if a path does not exist, is not a folder, or is not readable. Ignore None."""
-    _check_readable(path, flag, "a folder", "the folder that contains the files")
+    _check_readable(path, flag, "a folder")
 
 
-def _check_readable(path: Path | None, flag: str, expected: str, advice: str) -> None:
+def _check_readable(path: Path | None, flag: str, expected: str) -> None:
     if path is None:
         return
     mode = _existing_mode(path, flag)
     kind = {stat.S_IFREG: "a file", stat.S_IFDIR: "a folder"}.get(stat.S_IFMT(mode), "a pipe or a device")
     if kind != expected:
-        raise InputError(f"{path}, given with {flag}, is {kind}; give {advice}")
+        raise InputError(f"{path}, given with {flag}, is {kind}; give {expected}")
     if flag != "--colmap":  # a project folder may also contain outputs
         protect_inputs(path)
     _check_access(path, flag)
@@ -53,14 +53,12 @@ def _existing_mode(path: Path, flag: str) -> int:
 
 
 def _mode(path: Path, flag: str) -> int | None:
-    """Return the mode of a file or folder; None if it does not exist."""
+    """Return the mode of a file or folder; None if it does not exist. Raise an error for a broken link."""
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         if path.is_symlink():
-            raise FileNotFoundError(
-                f"{path} (a broken link), given with {flag}, does not exist; check the path"
-            ) from None
+            raise FileNotFoundError(f"{path}, given with {flag}, is a broken link; check the path") from None
         return None
     except OSError as error:  # a link to itself, a name that is too long, a folder without search permission
         raise OSError(
@@ -97,9 +95,9 @@ def check_writable_folder(path: Path | None, flag: str) -> None:
         if mode is None:
             continue
         if not stat.S_ISDIR(mode):
-            raise InputError(f"{parent}, given with {flag}, is not a folder; give another path")
+            raise InputError(f"{parent}, needed for {flag}, is not a folder; give another path")
         if not os.access(parent, os.W_OK | os.X_OK):
-            raise PermissionError(f"{parent}, given with {flag}, is not writable; give another folder")
+            raise PermissionError(f"{parent}, needed for {flag}, is not writable; give another path")
         return
 
 
@@ -125,23 +123,23 @@ def check_run_config(config: Path, data: Path | None, step: int | None = None, *
     _check_access(config, "--load-config")
     if data is not None and not data.exists():
         raise FileNotFoundError(
-            f"The dataset {data}, given with --data, does not exist. Give the folder or the transforms.json that "
-            "ns-train used."
+            f"The dataset {data}, given with --data, does not exist. Give the current path of the dataset."
         )
     paths = read_config_paths(config)
     located = data is not None or (run_dir / "splat.json").is_file()  # a lifted splat stores its image paths
     if not located and len(paths.data) > 0 and not any(path.exists() for path in paths.data):
         raise FileNotFoundError(
-            f"The dataset of {config} is not at {' or at '.join(map(str, paths.data[:2]))}. If it was moved, give its "
-            "new path with --data."
+            f"The dataset of {config} is not at {' or at '.join(map(str, paths.data[:2]))}. If it was moved, move "
+            "it back, or give its new path with --data (not in ns-normlift-serve)."
         )
     checkpoints = run_dir / "nerfstudio_models"
     pattern = "step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"
     if checkpoints.is_dir() and not any(checkpoints.glob(pattern)):
         files = ", ".join(sorted(path.name for path in checkpoints.iterdir())[:10]) or "nothing"
+        others = step is not None and any(checkpoints.glob("step-*.ckpt"))
         raise FileNotFoundError(
-            f"A checkpoint {pattern} is missing in {checkpoints}, which contains {files}. Copy it to this folder"
-            f"{'' if step is None else ', or leave out --load-step to use the last checkpoint'}."
+            f"The checkpoint {pattern} is missing in {checkpoints}, which contains {files}. Copy it to this folder"
+            f"{', or leave out --load-step to use the last checkpoint' if others else ''}."
         )
 
 

@@ -280,7 +280,7 @@ class NormLiftQuery(CheckedOptions):
         check_sam_checkpoint(model, TEXT_PROMPT_FAMILIES)
         run, question = self._run, result.question
         count = len(run.scene.train)
-        common.info(f"Running SAM 3 on {min(self.segment_views, count)} of {count} training views")
+        common.info(f"Running SAM 3 on {min(self.segment_views, count)} of {count} training view{'s' * (count != 1)}")
         cached = CachedTextMasks(model, device, cache_folder(run.folder) / "masks")
         segmented = query_sam3(
             run.scene,
@@ -347,7 +347,8 @@ class NormLiftQuery(CheckedOptions):
         texts = [item.text for item in found.catalog.objects]
         if len(texts) > 0 and all(text.startswith("object ") for text in texts):
             advice = "" if self.vocabulary is not None else "; give words of your own with --vocabulary FILE"
-            common.info(f"No word of the vocabulary clearly matches an object{advice}.")
+            problem = "No word of the vocabulary clearly matches an object" if known.words else "There is no vocabulary"
+            common.info(f"{problem}{advice}.")
         if self.output_json is not None:
             write_text_file(self.output_json, json.dumps(document, indent=2) + "\n", overwrite=self.overwrite)
         if self.objects_dir is not None:
@@ -378,8 +379,8 @@ class NormLiftQuery(CheckedOptions):
         written.update(Path(os.path.realpath(path)) for path in tables)
         for folder in filter(None, (self.render_dir, self.explain_dir, self.objects_dir)):
             place = Path(os.path.realpath(folder))
-            if written & {place, *place.parents}:
-                raise InputError(f"{folder} is given both as a folder and as a file; give another path for one of them")
+            for path in written & {place, *place.parents}:
+                raise InputError(f"{path} is an output file, but {folder} needs a folder there; give another path")
         refuse_existing(*self._existing_renders(), overwrite=self.overwrite, flags="--render-dir")
 
     def _check_texts(self) -> None:
@@ -513,7 +514,8 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         rules: Keyword arguments of `QuickRun.ask`.
         lines: Prompts in UTF-8. If None, read standard input.
     Raises:
-        ValueError: Standard output is closed, or some prompts failed. The JSON line of each has the key `error`.
+        ValueError: Standard output is closed, or some prompts failed. The JSON line of each such prompt has the key
+            `error`.
     """
     stdin: Any = sys.stdin  # None if it is closed
     source: Iterable[bytes] = (() if stdin is None else stdin.buffer) if lines is None else lines
@@ -563,14 +565,14 @@ def print_answer(
     common.CONSOLE.print(answer_table(rows, rule, question.threshold, coordinates, narrow=narrow))
     for row in rows:
         if row["read_as"] is not None:
-            common.info(f'{row["text"]}: read as "{row["read_as"]}"; the encoder ignores the other words.')
+            common.info(f'{row["text"]}: read as "{row["read_as"]}"; the encoder ignores the rest of the prompt.')
         if row["verdict"] in ("weak match", "probably not here"):
             position = "" if row["nearest"] is None else f", near {common.format_number(row['nearest'])}"
             peak = common.format_number(row["peak"])
             common.info(f"{row['text']}: {row['verdict']}. The largest relevancy is {peak}{position}.")
     loose = [row["text"] for row in rows if _is_loose(row, question.threshold)]
     if len(loose) > 0:
-        common.info(f"{', '.join(loose)} may select too much; add --threshold auto to use the suggested threshold.")
+        common.info(f"{', '.join(loose)} may select too much; try a larger --threshold, as in the column suggested.")
 
 
 def _is_loose(row: dict[str, Any], threshold: float) -> bool:
@@ -657,8 +659,8 @@ def print_catalog(catalog: Catalogue, coordinates: Literal["scene", "capture"] =
             for sizes in [[item.gaussians for item in catalog.objects if item.text == text]]
         ]
         common.info(
-            f"{'; '.join(parts)}. The table lists only the {_LARGEST} largest objects; write all with "
-            "--objects-dir FOLDER."
+            f"{'; '.join(parts)}. The table lists only the {_LARGEST} largest objects; --objects-dir FOLDER writes "
+            "files with all of them."
         )
     if catalog.num_in_small_components > 0:
         common.info(f"Selected Gaussians in groups too small to be listed: {catalog.num_in_small_components:,}.")

@@ -69,7 +69,7 @@ def _hub(
     user: str, megabytes: float, license_name: str, data: str, repository: str,
     local: str, find: Callable[[], Path | None], download: Callable[[], Path],
 ) -> Weights:  # fmt: skip
-    """Return the entry for weights on the Hugging Face Hub.
+    """Return the entry for weights on the Hugging Face hub.
 
     Args:
         local: Required files of the repository, and the option that takes a local copy of them.
@@ -212,7 +212,7 @@ def _show(found: dict[str, Path | None]) -> None:
     missing = [name for name in ("imagenet", "edges") if found.get(name) is None]
     if len(missing) > 0:
         info(f"Fetch weights with: ns-normlift-weights --get {' '.join(missing)}")
-    info("Sizes on the hub are approximate. For the terms of the training data, add --output-json FILE.")
+    info("Sizes on the hub are approximate. --output-json FILE writes the terms of the training data.")
 
 
 def entrypoint() -> None:

@@ -29,8 +29,9 @@ def _load_method(name: str) -> Any:
         return getattr(import_module("normlift_ns.method_configs.normlift"), f"{name}_method")
     except Exception as error:  # any missing or broken dependency
         if sys.stderr is not None:
-            reason = f"{type(error).__name__}: {error}"
-            sys.stderr.write(f"normlift_ns: the method {name} cannot be used ({reason}). Other methods still work.\n")
+            method = "normlift" if name == "normlift" else f"normlift-{name.replace('_', '-')}"
+            problem = f"the method {method} cannot be used ({type(error).__name__}: {error})"
+            sys.stderr.write(f"normlift_ns: {problem}. Methods of other packages still work.\n")
         return None
 
 

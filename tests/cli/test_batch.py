@@ -282,7 +282,7 @@ def test_a_part_of_the_list_by_the_environment(tmp_path, monkeypatch, capsys):
         for name, value in array(task + 4, 3, least=4).items():
             monkeypatch.setenv(name, value)
         assert run_entry(monkeypatch, batch.entrypoint, made.list) == 0
-        assert f"5 captures in {made.list}, {2 if task < 2 else 1} of them in part {task + 1} of 3" in said(capsys)
+        assert f"5 captures in {made.list} ({2 if task < 2 else 1} in part {task + 1} of 3)" in said(capsys)
     lines = read_jsonl(made.results, batch.Outcome)
     assert len(lines) == len({line.key for line in lines}) == 5
     assert len(list(made.results.glob("*.jsonl"))) == 3
@@ -354,7 +354,7 @@ def test_what_the_environment_says_and_cannot_say():
         ({"RANK": "x", "WORLD_SIZE": "2"}, "RANK", "at least 0", "'x'"),
         ({"RANK": "0", "WORLD_SIZE": "0"}, "WORLD_SIZE", "at least 1", "'0'"),
         ({"SLURM_ARRAY_TASK_ID": "1"}, "SLURM_ARRAY_TASK_ID is set", "SLURM_ARRAY_TASK_COUNT is not"),
-        (array(7, 3, least=1), "SLURM_ARRAY_TASK_ID is 7", "COUNT (3)", "MIN (1)"),
+        (array(7, 3, least=1), "SLURM_ARRAY_TASK_ID is 7", "COUNT is 3", "MIN is 1"),
         (array(3, 2, least=0, step=2), "without gaps"),
         (array(0, 2, least=1), "without gaps"),
     ):

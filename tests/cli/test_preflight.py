@@ -64,9 +64,9 @@ LIFT = [
     ("--device cuda:x:", "--device must be auto, cpu or cuda, or a GPU such as cuda:1; got 'cuda:x:'"),
     ("--timestamp ../x", "'../x'", "folder name"),
     ("--timestamp old", "old exists", "--timestamp", "--output-dir", "not a lifted run"),
-    ("--output-dir file", "file, given with --output-dir"),
+    ("--output-dir file", "file, needed for --output-dir"),
     ("--output-dir dangling/x", "dangling", "link"),
-    ("--export-langsplat file", "file, given with --export-langsplat"),
+    ("--export-langsplat file", "file, needed for --export-langsplat"),
     ("--data nowhere", "nowhere, given with --data"),
     ("--load-step 3", "step-000000003.ckpt"),
     ("--regions-dir [/red]", "[/red], given with --regions-dir"),
@@ -87,7 +87,7 @@ SPLATS = [
     ("--load-gsplat fifo", "fifo, given with --load-gsplat", "pipe"),
     ("--load-ply file", "camera file", "none"),
     ("--load-ply file --colmap room --transforms x", "camera file", "two"),
-    ("--load-ply file --transforms dangling", "dangling (a broken link), given with --transforms"),
+    ("--load-ply file --transforms dangling", "dangling, given with --transforms, is a broken link"),
     ("--load-ply file --colmap room --masks none", "none, given with --masks"),
     ("--load-ply file --colmap room --timestamp old", "old exists", "--timestamp"),
     ("--load-config room", "config room is not a file"),
@@ -96,7 +96,7 @@ SPLATS = [
     ("--load-ply file --colmap nowhere", "nowhere, given with --colmap"),
     ("--load-ply file --transforms room --data x", "--data", "--load-config"),
     ("--load-ply file --transforms room --views some", "--views", "'some'"),
-    ("--load-config config.yml --colmap x", "--colmap", "--load-ply and --load-gsplat"),
+    ("--load-config config.yml --colmap x", "--colmap", "--load-ply or --load-gsplat"),
     ("--load-config config.yml --background white", "--background", "--load-ply"),
 ]
 CHECK = [("--output-json mine/answers.json", "answers.json exists", "--output-json", "--overwrite True")]
@@ -113,11 +113,11 @@ QUERY = [
     ("--text a --objects --objects-dir mine", "objects.json exists", "--objects-dir", "--overwrite True"),
     (("--text", "a", "sky blue", "--render-dir", "mine"), "sky_blue.png exists", "--render-dir", "--overwrite True"),
     ("--text a --output-json file/x", "--output-json is"),
-    ("--text a --output-json n --render-dir n/b", "n/b", "folder and as a file"),
+    ("--text a --output-json n --render-dir n/b", "n/b", "is an output file"),
     ("--text a --output-json n --output-npz n", "--output-json and --output-npz", ", n"),
-    ("--text a --render-dir file", "file, given with --render-dir"),
-    ("--text a --explain --explain-dir file", "file, given with --explain-dir"),
-    ("--text a --objects --objects-dir file", "file, given with --objects-dir"),
+    ("--text a --render-dir file", "file, needed for --render-dir"),
+    ("--text a --explain --explain-dir file", "file, needed for --explain-dir"),
+    ("--text a --objects --objects-dir file", "file, needed for --objects-dir"),
     ("--text a --text-embeddings none.npz", "none.npz, given with --text-embeddings"),
     ("--text a --render-views 9999 --output-json a.json", "--render-views", "--render-dir"),
     ("--text a --objects-dir x", "--objects-dir", "--objects"),
@@ -148,7 +148,7 @@ EXPORT = [
     ("--exporters note", "unknown exporter 'note'"),
     *((f"--output-dir mine --output-filename {x[0]}.ply", f"{x} exists", "--output-dir") for x in MY_EXPORTS),
     ("--object-max-gap nan", "--object-max-gap", "got nan"),
-    ("--output-dir file", "file, given with --output-dir"),
+    ("--output-dir file", "file, needed for --output-dir"),
     ("--output-filename /", "--output-filename"),
     ("--text a --transfer none.ply", "none.ply, given with --transfer"),
     ("--text a --select clean --masks-dir m", "--masks-dir"),
@@ -175,8 +175,7 @@ VIEW = [
     ("--port 70000", "--port", "65,535", "70000"),
     ("--load-config no.yml", "no.yml"),
     ("--device tpu", "--device", "'tpu'"),
-    ("--host 192.0.2.1", "--host 192.0.2.1"),
-    (f"--host {'a' * 70}", f"--host {'a' * 70}"),
+    *((f"--host {name}", f"--host {name}") for name in ("192.0.2.1", "a" * 70)),
     ("--text-embeddings none.npz", "none.npz, given with --text-embeddings"),
 ]
 SERVE = [("", "No run is given", "ns-normlift-serve RUN/config.yml"), ("nowhere/config.yml", "nowhere/config.yml")]
@@ -227,7 +226,7 @@ def test_a_cache_that_is_a_file_or_a_locked_folder_is_refused_early(config, tmp_
     (tmp_path / "room" / "normlift").mkdir(parents=True)
     (tmp_path / "room" / "normlift" / ".cache").touch()
     (tmp_path / "locked").mkdir(mode=0o500)
-    folders = {tmp_path: ".cache, given with --output-dir", tmp_path / "locked" / "new": "is not writable"}
+    folders = {tmp_path: ".cache, needed for --output-dir", tmp_path / "locked" / "new": "is not writable"}
     for folder, fact in list(folders.items())[: 1 if os.geteuid() == 0 else 2]:  # root may write everywhere
         assert run_entry(monkeypatch, lift.entrypoint, "--load-config", config, *COLOUR, "--output-dir", folder) == 1
         assert fact in said(capsys)
