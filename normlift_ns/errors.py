@@ -38,6 +38,16 @@ class PathError(InputError, OSError):
     """InputError for a path that is not valid for any file; also an OSError, as in Python's own functions."""
 
 
+def json_type(value: object) -> str:
+    """Return the JSON type of a value for error messages, with an article.
+
+    >>> json_type([1, 2]), json_type(None)
+    ('a list', 'null')
+    """
+    names = ((bool, "true or false"), (str, "a string"), (list, "a list"), (dict, "an object"), (type(None), "null"))
+    return next((name for kind, name in names if isinstance(value, kind)), "a number")
+
+
 class MissingImageError(InputError, KeyError, IndexError):
     """InputError for a training image that does not exist; also a KeyError and an IndexError."""
 

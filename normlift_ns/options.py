@@ -510,10 +510,10 @@ class SourceOptions:
     """Encoder of regions and prompts. open_clip: CLIP, applied to masked crops or to patches. siglip, siglip2,
     metaclip2: networks of the transformers library, applied in the same way. imagenet: a small classifier; prompts are
     names of its 1,000 classes, or of groups of classes such as dog. Fetch its weights with ns-normlift-weights --get
-    imagenet. color: mean colors, compared with color names; needs no weights. auto: open_clip if --encoder-model,
-    --encoder-pretrained, --prompt-template or --features langsplat is given. Otherwise, auto selects the first of
-    open_clip, siglip2, siglip, metaclip2, imagenet and color whose default weights are on this machine. Any other name:
-    an encoder from an installed plugin."""
+    imagenet. color: mean colors, compared with color names; needs no weights. auto: open_clip with --features
+    langsplat, or if --encoder-model, --encoder-pretrained or --prompt-template differs from its default. Otherwise,
+    auto selects the first of open_clip, siglip2, siglip, metaclip2, imagenet and color whose default weights are on
+    this machine. Any other name: an encoder from an installed plugin."""
     encoder_model: str = DEFAULT_MODEL
     """Network of the encoder. open_clip: the name of an architecture. siglip, siglip2, metaclip2: a Hugging Face model
     name or a local folder. Without this option, siglip uses google/siglip-base-patch16-224, siglip2 uses

@@ -255,7 +255,7 @@ def _similarity(one: Tensor, other: Tensor, features: Tensor, spread: float) -> 
 
 
 def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
-    """Join Gaussians to parts, and return the part of each Gaussian, numbered from 0 without gaps."""
+    """Merge Gaussians into parts, and return the part of each Gaussian, numbered from 0 without gaps."""
     part, size = np.arange(num_gaussians), np.ones(num_gaussians)
     images = float(np.median(borders.observed)) if len(borders.observed) > 0 else 0.0
     for level in _LEVELS:

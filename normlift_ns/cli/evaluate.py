@@ -59,7 +59,8 @@ class NormLiftEval(CheckedOptions):
     a camera path."""
     compare: Literal["paper"] | None = None
     """Published results to compare with yours, in the printed tables and in the output file. paper: results of the
-    paper for --protocol scannet or lerf, and for the studies ablation, signals and timing."""
+    paper. Needs --protocol scannet, which also compares the studies ablation and signals, or lerf, which also compares
+    timing."""
     text_embeddings: Path | None = None
     """NPZ file with one vector per class name, used instead of the text encoder of the runs."""
     data: Path | None = None

@@ -305,10 +305,11 @@ def check_dense_tensor(value: Tensor, name: str, path: Path) -> None:
         or value.is_nested
         or value.numel() * value.element_size() > value.untyped_storage().nbytes()
     ):
-        size = "" if value.layout != torch.strided else f" with {value.untyped_storage().nbytes():,} bytes of data"
+        size = "" if value.layout != torch.strided else f", stored bytes {value.untyped_storage().nbytes():,}"
         raise InputError(
-            f"{path}: {name} is a tensor of {value.dtype}, {value.layout}, {tuple(value.shape)} on "
-            f"{value.device}{size}, expected a dense array of real numbers. Save the file again with plain tensors."
+            f"{path}: the tensor {name} cannot be used (type {value.dtype}, layout {value.layout}, shape "
+            f"{tuple(value.shape)}, device {value.device}{size}), expected a dense array of real numbers on the CPU "
+            "with all values stored. Save the file again with tensor.cpu().contiguous()."
         )
 
 

@@ -18,7 +18,7 @@ from normlift_ns.encoders.base import FeatureSource, PrecomputedFeatures, Region
 from normlift_ns.encoders.plugins import PluginRegions
 from normlift_ns.encoders.registry import absolute_if_exists, absolute_paths, find_encoder_kind, make_encoder
 from normlift_ns.encoders.text_files import CachedTextEncoder, TextEmbeddingFile, TextEncoder
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, json_type
 from normlift_ns.options import SourceOptions
 from normlift_ns.segmentation.registry import MASK_SOURCES, check_mask_options, resolve_source
 
@@ -92,7 +92,7 @@ def restore_source(manifest: Mapping[str, Any], device: str = "cpu") -> FeatureS
         )
     try:
         if not isinstance(settings, Mapping):
-            raise TypeError(f"found {type(settings).__name__}, expected an object")
+            raise TypeError(f"found {json_type(settings)}, expected an object")
         values: Any = {name: Path(x) if name in _PATHS and x is not None else x for name, x in settings.items()}
         options = SourceOptions(**values)
     except TypeError as error:

@@ -13,7 +13,7 @@ from typing import Any
 
 from normlift_ns.encoders import weights
 from normlift_ns.encoders.weights import CONFIG_FILE, read_json
-from normlift_ns.errors import InputError, truncate_text
+from normlift_ns.errors import InputError, json_type, truncate_text
 from normlift_ns.options import DEFAULT_MODEL, DEFAULT_PRETRAINED, SourceOptions
 
 _PUNCTUATION = str.maketrans("", "", string.punctuation)
@@ -158,7 +158,7 @@ class ModelFolder:
     text: dict[str, Any]
     vision: dict[str, Any]
     sizes: dict[str, Any]
-    """Sizes of the whole network. The keys, also of `text` and `vision`, are those of transformers configurations."""
+    """`projection_dim`, if the configuration has it. The keys of all sizes are those of transformers configurations."""
     pixels: PixelNormalization
     tokens: TokenPadding
     weights: tuple[Path, ...]
@@ -213,7 +213,7 @@ def _sizes(values: object, where: str) -> dict[str, Any]:
     if values is None:
         return {}
     if not isinstance(values, Mapping):
-        raise InputError(f"{where} of {CONFIG_FILE} is {type(values).__name__}, expected an object")
+        raise InputError(f"{where} of {CONFIG_FILE} is {json_type(values)}, expected an object")
     sizes: dict[str, Any] = {}
     for key, maximum in _MAX_SIZES.items():
         value = values.get(key)
@@ -250,7 +250,7 @@ def _pixels(path: Path, family: ModelFamily, kind: str) -> PixelNormalization:
     settings = read_json(path / file)
     settings = settings.get("image_processor", settings)
     if not isinstance(settings, Mapping):
-        raise InputError(f"image_processor of {file} is {type(settings).__name__}, expected an object")
+        raise InputError(f"image_processor of {file} is {json_type(settings)}, expected an object")
     factor = _number(settings.get("rescale_factor", 1 / 255), f"rescale_factor of {file}", 1e-6, 1e3)
     factor = factor if settings.get("do_rescale", True) is not False else 1.0
     mean, std = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)

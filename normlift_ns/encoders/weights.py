@@ -18,11 +18,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from normlift_ns.errors import InputError, summarize_error
-from normlift_ns.io.guard import read_file, read_text
+from normlift_ns.errors import InputError, json_type, summarize_error
+from normlift_ns.io.guard import MAX_TEXT_BYTES, read_file, read_text
 
 CONFIG_FILE = "config.json"
-_MAX_JSON_BYTES = 2**27
 _PROBE_SECONDS = 10
 _HUB = "https://huggingface.co"
 CONNECT_ONCE = "connect to the internet (ns-normlift-weights lists and downloads default weights)"
@@ -130,18 +129,18 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that contains an object.
 
     Raises:
-        InputError: If the file does not exist, is larger than 128 MiB, is not JSON, or does not contain an object.
+        InputError: If the file does not exist, is larger than 64 MiB, is not JSON, or does not contain an object.
     """
     if not path.is_file():
         raise InputError(f"{path.name} is missing" if not os.path.lexists(path) else f"{path.name} is not a file")
-    if path.stat().st_size > _MAX_JSON_BYTES:
-        raise InputError(f"{path.name} has {path.stat().st_size:,} bytes, more than {_MAX_JSON_BYTES:,}")
+    if path.stat().st_size > MAX_TEXT_BYTES:
+        raise InputError(f"{path.name} has {path.stat().st_size:,} bytes, expected at most {MAX_TEXT_BYTES:,}")
     try:
         content = json.loads(read_text(path))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path.name} cannot be read as JSON ({type(error).__name__})") from None
     if not isinstance(content, dict):
-        raise InputError(f"{path.name} contains {type(content).__name__}, expected an object")
+        raise InputError(f"{path.name} contains {json_type(content)}, expected an object")
     return content
 
 

@@ -131,7 +131,10 @@ _MAX_REGIONS = 20
 
 @dataclass(frozen=True)
 class WeakRegion:
-    """Connected visible Gaussians with little reliable evidence. Means are weighted by surface."""
+    """Connected visible Gaussians with little reliable evidence.
+
+    In means and shares, each Gaussian counts by its largest weight in an image, as a measure of its visible surface.
+    """
 
     size: int
     """Number of Gaussians in the region."""
@@ -154,7 +157,7 @@ class WeakRegion:
     views: float
     """Mean number of lifted views that show a Gaussian with at least a tenth of its largest weight in an image."""
     unsupported: float
-    """Share of Gaussians that voting cannot repair, because neither they nor their neighbors have evidence."""
+    """Share of Gaussians that voting cannot repair, because neither they nor their neighbors have evidence, in 0..1."""
 
 
 class GaussianEvidence(NamedTuple):
@@ -430,7 +433,7 @@ class Pose:
     gain: float
     """Expected increase of the mean reliability of all surfaces, in addition to the lift and the previous poses."""
     regions: list[int]
-    """Numbers of the regions in the image, from 1."""
+    """Positions in `Coverage.regions`, from 1, of the regions that the camera shows."""
     shown: float
     """Largest value of `visible_shares` over the regions, in 0..1."""
 
@@ -696,7 +699,7 @@ class SuggestedImage:
     gain: float
     """Expected increase of the mean reliability of all surfaces, in addition to the lift and the previous images."""
     regions: list[int]
-    """Numbers of the regions in the image, from 1."""
+    """Positions in `Coverage.regions`, from 1, of the regions that the image shows."""
 
 
 @check_arguments

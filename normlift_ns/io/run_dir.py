@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from normlift_ns.errors import InputError
+from normlift_ns.errors import InputError, json_type
 from normlift_ns.io.atomic import (
     complete_interrupted_writes,
     file_digest,
@@ -256,7 +256,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], dict[str, str] | None]:
         text = read_text(path)
         facts = json.loads(text)
         if not isinstance(facts, dict):
-            raise InputError(f"its content has type {type(facts).__name__}, expected a JSON object")
+            raise InputError(f"it contains {json_type(facts)}, expected a JSON object")
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"the semantic field in {folder} is damaged or cannot be read ({path}: {error}); {LIFT_AGAIN}"

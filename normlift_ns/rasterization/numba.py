@@ -554,7 +554,7 @@ def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, l
 
 @kernel
 def _label_span(ranges, first, stop):  # pragma: no cover (compiled)
-    """Return the range (first, stop) of label numbers in some rows."""
+    """Return the smallest label number in the rows `first` to `stop` - 1, and the largest one plus 1."""
     least, greatest = ranges[first, 0], ranges[first, 1]
     for row in range(first + 1, stop):
         least, greatest = min(least, ranges[row, 0]), max(greatest, ranges[row, 1])

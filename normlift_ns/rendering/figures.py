@@ -610,7 +610,7 @@ def save_inventory(
 
 
 def _numbered(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "m h w"], names: Sequence[str]) -> Image.Image:
-    """Draw the outline of every mask, and its number and name at the widest part of the mask."""
+    """Draw the outline of every mask, and its number and name at a position well inside the mask."""
     height, width = image.shape[:2]
     line = max(1, round(max(height, width) * _OUTLINE_FRACTION))
     canvas, size = image.clone().cpu(), max(12, max(height, width) // 40)

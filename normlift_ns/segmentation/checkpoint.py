@@ -20,7 +20,7 @@ from torch import Tensor
 
 from normlift_ns.encoders import weights
 from normlift_ns.encoders.weights import CONFIG_FILE, SAM_WEIGHT_FILES, read_json
-from normlift_ns.errors import InputError, summarize_error
+from normlift_ns.errors import InputError, json_type, summarize_error
 from normlift_ns.io.atomic import file_digest
 from normlift_ns.io.guard import check_regular
 from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, SamPrecision
@@ -164,7 +164,7 @@ def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
     parts = {name: own.get(name) for name in kind.config_parts} if isinstance(own, Mapping) else {}
     for name, part in parts.items():
         if not isinstance(part, Mapping):
-            found = "missing" if part is None else type(part).__name__
+            found = "missing" if part is None else json_type(part)
             raise InputError(f"{name} of config.json is {found}, expected an object")
     sizes = check_config_sizes(parts)
     for path, expected in kind.nested_types:

@@ -63,7 +63,7 @@ class Session:
     line: str = ""
     """Text in the prompt box."""
     clicks: dict[str, Any] = field(default_factory=dict)
-    """Clicked Gaussians or their directions, by the prompt texts that stand for the clicks."""
+    """Directions of clicked Gaussians, by the prompt texts that stand for the clicks."""
 
 
 class Controller(ABC):
@@ -307,7 +307,7 @@ class Controller(ABC):
         """Start a query for all Gaussians similar to a clicked one.
 
         Args:
-            clicked: Index or direction of the clicked Gaussian.
+            clicked: Direction of the clicked Gaussian.
             stored: Prompt texts that are already in use, in addition to those of other clicks.
         """
         with self._lock:

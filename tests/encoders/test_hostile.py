@@ -121,7 +121,7 @@ def test_entries_of_text_vectors_are_checked_before_they_are_read(tmp_path: Path
     for content, parts in (
         (entry("fox", npy(np.ones(150_000))), ["'fox'", "1,200,128", "1,048,576"]),
         (entry("fox", b"no array"), ["'fox'", "NPY"]),
-        (entry("fox", ones[:-3]), ["'fox'", "float64 need 32 bytes", "29"]),
+        (entry("fox", ones[:-3]), ["'fox'", "float64 needs 32 bytes", "29"]),
         (entry("fox", ones, npy(np.arange(4.0))), ["two vectors for 'fox'"]),
         (npz(fox=np.ones(4, np.longdouble)), ["'fox'", np.dtype(np.longdouble).name]),
         (npz(fox=np.ones((2, 4))), ["'fox'", "float64 (2, 4)"]),

@@ -147,7 +147,7 @@ def test_texts_asked_before_need_no_weights(folder: Path, tmp_path: Path) -> Non
     config.write_text(config.read_text() + " ")
     again = text_encoder_for(of_grid, cache=tmp_path / "texts")
     assert (again.rows(["red mug"]) == expected[:1]).all()
-    refused(lambda: again.rows(["wine"]), "siglip2", "--text-embeddings")
+    refused(lambda: again.rows(["wine"]), "siglip2", "text_embeddings")
     folder.rename(tmp_path / "gone")
     (tmp_path / "manifest.json").write_text(json.dumps(field.manifest))
     program = (

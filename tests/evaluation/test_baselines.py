@@ -231,7 +231,7 @@ def test_what_is_left_out_is_said(lifted):
     (row,) = study_timing([lifted], "cpu", told.append)
     assert "dense512_s" not in row
     assert row["total_s"] == pytest.approx(sum(value for key, value in row.items() if key.endswith("_s")) / 2)
-    assert len(told) == 1 and baselines.timing_obstacle(lifted, "cpu") in told[0] and "--device cpu" in told[0]
+    assert len(told) == 1 and baselines.timing_obstacle(lifted, "cpu") in told[0] and "--device cuda" in told[0]
     cost = {key: value for key, value in lifted.field.manifest["cost"].items() if key != "store_s"}
     older = changed(lifted, cost=cost)
     table = study_timing([lifted, older], "cpu")

@@ -179,7 +179,7 @@ def test_arrays_that_lead_outside_are_refused(form: str, tmp_path: Path) -> None
 def test_a_product_never_reads_outside_of_its_table() -> None:
     rows = SparseRows(torch.tensor([0, 2]), torch.tensor([0, 5]).int(), torch.ones(2))
     assert rows.num_columns == 6
-    with pytest.raises(ValueError, match=r" 6 columns.* 5"):
+    with pytest.raises(ValueError, match=r"column \(6\).* 5"):
         rows.matmul(torch.ones(5, 1))
     assert rows.matmul(torch.ones(6, 1)).tolist() == [[2.0]]
     for broken in (
