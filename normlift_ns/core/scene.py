@@ -15,8 +15,8 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.options import RasterizeMode
 
 _TOLERANCE = 1e-5
-"""Relative tolerance at which two camera parameters count as equal. The absolute tolerance for values near zero is a
-tenth of it."""
+"""Relative tolerance within which two numbers of a camera summary count as equal. For values near zero,
+the absolute tolerance is a tenth of it."""
 
 
 @check_arguments
@@ -45,7 +45,7 @@ class View(NamedTuple):
     def downscaled(self, height: int, width: int) -> View:
         """Downscale the image by averaging pixels, and adapt its camera.
 
-        A pixel of the mask is True only if it is True for all averaged pixels.
+        A pixel of the mask is True only if the mask is True at all averaged pixels.
         """
         camera = self.camera
         scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
@@ -70,7 +70,7 @@ class Views(Protocol):
 
     @property
     def cameras(self) -> Sequence[Camera]:
-        """Cameras of the images, in the same order. No image is read."""
+        """Cameras of the images, in the order of `names`. No image is read."""
         ...
 
     def __len__(self) -> int: ...
@@ -123,7 +123,7 @@ class Scene(Protocol):
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
-        """Rasterization mode of the training, which a lift should use too."""
+        """Rasterization mode that was used in training, and that a lift should also use."""
         ...
 
     @property

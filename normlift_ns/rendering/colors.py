@@ -1,6 +1,6 @@
 """Colors and legends of query results, the same in every viewer and figure.
 
-The default colormap of relevancy is perceptually uniform and readable with color blindness. Opacity rises with
+The default colormap of relevancy is perceptually uniform and readable with color blindness. Opacity increases with
 relevancy, so that weak matches are less visible. A prompt that names a saturated color is drawn in this color, unless
 an earlier prompt has it. Other prompts get colors that are distinguishable with any color vision (Okabe and Ito, 2008),
 or further hues if these colors are used up.
@@ -88,7 +88,10 @@ def named_color(text: str) -> tuple[float, float, float] | None:
 
 
 def prompt_colors(texts: Sequence[str]) -> Float[Tensor, "q 3"]:
-    """Return a color for each prompt, RGB in 0..1: the color that it names, or else a distinguishable color.
+    """Return a color for each prompt, RGB in 0..1.
+
+    It is the color that the prompt names, unless an earlier prompt has this color. Otherwise, it is distinguishable
+    from the other colors.
 
     >>> (prompt_colors(["fox", "sky blue", "sky blue bowl"]) * 255).round().int().tolist()
     [[230, 159, 0], [117, 187, 253], [0, 158, 115]]
@@ -123,7 +126,7 @@ def _candidates() -> tuple[tuple[float, ...], ...]:
 
 
 RGB = tuple[float, float, float]
-"""RGB in 0..1."""
+"""RGB color with components in 0..1."""
 
 
 def prompt_rgb_tuples(texts: Sequence[str]) -> list[RGB]:
@@ -139,7 +142,8 @@ def prompt_rgb_tuples(texts: Sequence[str]) -> list[RGB]:
 
 
 MIN_LEGEND_HEIGHT = 160
-"""Minimum height in pixels of an image with a legend. Smaller images, as rendered while the camera moves, have none."""
+"""Minimum height in pixels of an image with a legend. Smaller images, such as those rendered while the camera
+moves, have none."""
 _MAX_PROMPTS = 12
 _BACKDROP, _INK = (20, 20, 20), (255, 255, 255)
 _BACKDROP_OPACITY = 0.75
@@ -178,7 +182,7 @@ def add_color_bar(
 
 
 def add_prompt_legend(image: Float[Tensor, "h w 3"], texts: Sequence[str], colors: Float[Tensor, "q 3"]) -> Tensor:
-    """Add prompts and their colors to the lower right corner of an image [H, W, 3], if there is enough space."""
+    """Add a legend of prompts to the lower right corner of an image [H, W, 3], if there is enough space."""
     height, width = image.shape[:2]
     if height < MIN_LEGEND_HEIGHT or len(texts) == 0:
         return image
@@ -189,7 +193,7 @@ def add_prompt_legend(image: Float[Tensor, "h w 3"], texts: Sequence[str], color
 
 
 def _font_size(height: int) -> int:
-    """Return the font size in pixels for an image height."""
+    """Return the font size in pixels for an image of the given height."""
     return max(11, height // 42)
 
 
