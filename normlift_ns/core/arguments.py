@@ -65,7 +65,7 @@ def check_arguments(target: _T) -> _T:
 
 
 def _checks_of(owner: Any, function: Any) -> tuple[Callable[[], Iterable[tuple[str, _Check]]], dict[str, _Check]]:
-    """Return a function that iterates over (name, check) pairs of positional arguments, and all checks by name."""
+    """Return a function that yields (name, check) pairs for positional arguments, and a dictionary of all checks."""
     hints = get_type_hints(owner, localns=cast(Any, _Names(sys.modules[owner.__module__].__dict__)))
     named, ordered, more = dict[str, _Check](), list[tuple[str, _Check]](), ("", _anything)
     for p in inspect.signature(function).parameters.values():

@@ -1,12 +1,12 @@
 """Consensus of regions across views, computed before the lift.
 
-An error in a 2D feature affects its whole region in one view, so neighboring Gaussians share it. Regions of other views
-that cover the same Gaussians usually do not have this error. The consensus therefore moves each feature toward those of
-overlapping regions in other views. Let E be the evidence and F_s the feature of region s. Let W_jv(s) be the weight of
-Gaussian j in the view of s, including pixels without a region. Let t be a region of another view v. Sums over j run
+An error in a 2D feature affects its whole region in one view, so neighboring Gaussians have the same error. Regions of
+other views that cover these Gaussians usually do not have it. The consensus therefore moves each feature toward those
+of overlapping regions in other views. Let E be the evidence and F_s the feature of region s. Let W_jv(s) be the weight
+of Gaussian j in the view of s, including pixels without a region. Let t be a region of another view v. Sums over j run
 over the Gaussians that are visible in both views::
 
-    p_js = E_js / W_jv(s)                                        share of j that lies in s, 0 if below 0.02
+    p_js = E_js / W_jv(s)                                        share of the weight of j in s, 0 if below 0.02
     c_st = sum_j p_js p_jt / sum_j p_js                          share of s that lies in t
     J_st = 1 / (1 / c_st + 1 / c_ts - 1)                         soft intersection over union, symmetric, in 0..1
     B    = sum_sv a_sv max_{t in v} J_st / sum_sv a_sv           weighted mean of the best overlaps
@@ -217,9 +217,9 @@ def sample_gaussians(
 ) -> tuple[Int64[Tensor, " m"], Float64[Tensor, " m"]]:
     """Sample Gaussians until every region has at least `least` of them, or all of its Gaussians.
 
-    Each Gaussian has a pseudo-random number in [0, 1) that depends only on its index. A region samples its Gaussians
-    whose numbers are below a limit, and doubles the limit until the sample is large enough. Sums over the sample
-    estimate sums over all Gaussians if every term is divided by the sampling probability of its Gaussian.
+    Each Gaussian has a pseudo-random number in [0, 1) that depends only on its index. A region samples those of
+    its Gaussians whose numbers are below a limit, and doubles the limit until the sample is large enough. Sums over the
+    sample estimate sums over all Gaussians if every term is divided by the sampling probability of its Gaussian.
 
     Args:
         portion: Partition of the Gaussians, if several processes lift the scene. `rows` then covers the Gaussians of
@@ -377,9 +377,9 @@ def _medians(values: Float64[Tensor, " m"], group: Int64[Tensor, " m"], groups: 
 
 
 _Block = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Sums for a block of regions s. The first tensor, [regions, views], is the sum of p_js over the Gaussians that
-are visible in each view, and the second is a_sv. The others are s, t and sum_j p_js p_jt for regions t of other views
-with c_st >= `MIN_OVERLAP`."""
+"""Sums for a block of regions s. The first tensor, [regions, views], is the sum of p_js over the Gaussians that are
+visible in each view, and the second is a_sv. The others are s, t and sum_j p_js p_jt for regions t of other views with
+c_st >= `MIN_OVERLAP`."""
 
 
 def _inner_products(

@@ -109,7 +109,7 @@ _triton_lock = Lock()
 
 
 def load_triton() -> None:
-    """Compute the hash of Triton's files and load its driver, once in this process. All Triton kernels need both.
+    """Compute the hash of Triton's files and load its driver, once per process. All Triton kernels need both.
 
     Without the lock, every thread that compiles a kernel would compute the hash and compile the driver. Errors are
     ignored here, because they occur again when the first kernel is compiled.

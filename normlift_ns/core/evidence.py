@@ -123,7 +123,7 @@ class Evidence(TensorRecord):
         """Build evidence from the entries of all views, in the given order.
 
         Raises:
-            ValueError: If a number is out of range, for example `num_gaussians` is not in 0..2**31 - 1. Also if entries
+            ValueError: If a count or `weight_power` is out of range (`num_gaussians`: 0..2**31 - 1). Also if entries
                 are not distinct and sorted, have invalid indices, or have negative or non-finite weights.
         """
         if not 0 <= num_gaussians < 2**31:
@@ -196,7 +196,7 @@ class Evidence(TensorRecord):
     def select_gaussians(self, gaussians: Int[Tensor, " m"]) -> Evidence:
         """Return the evidence of the given Gaussians, in the order of `gaussians`.
 
-        `num_excluded` is kept, but is at most the number of given Gaussians.
+        `num_excluded` is kept, but capped at the number of given Gaussians.
 
         Raises:
             ValueError: If a Gaussian does not exist.

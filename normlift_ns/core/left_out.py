@@ -1,4 +1,4 @@
-"""Quality of a lift, measured without labels by the recognition of regions in views that were left out.
+"""Quality of a lift, measured without labels by the recognition of regions in left-out views.
 
 Half of the views are left out, the others are lifted, and the left-out regions are compared with the lift. Then the
 halves are swapped. Let s be a region of a left-out view, and u_j the directions of the Gaussians from the kept views.

@@ -154,7 +154,7 @@ class StoredDirections(TensorRecord):
 
 
 def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, " n"]) -> StoredDirections:
-    """Store the directions of all Gaussians that have one.
+    """Convert the directions of a lift to their storage form.
 
     Args:
         basis: Basis vectors as rows, to store coordinates, or None to store full directions.

@@ -77,9 +77,9 @@ def classify(
 
     Args:
         valid: Mask of the Gaussians with a direction, from `SemanticField.valid`.
-        without_direction: Class of the other Gaussians. "none" is `NO_CLASS`, which only lowers scores of the true
-            class. "first" is class 0, the arg-max of a zero feature in published scripts. It adds false positives to
-            this class, which is wall in ScanNet.
+        without_direction: Class of the other Gaussians. "none" is `NO_CLASS`, which lowers only the scores of the true
+            class. "first" is class 0, the argmax for a zero feature in published scripts. It adds false positives to
+            class 0, which is wall in ScanNet.
     """
     best = scores.argmax(dim=1)
     return torch.where(valid, best, NO_CLASS if without_direction == "none" else 0)

@@ -47,7 +47,7 @@ def refine(
     neighbors: Neighbors | None = None,
     progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
-    """Refine the direction of every Gaussian i to directions[source[i]] by a vote of its neighbors, and return source.
+    """Select source[i] for every Gaussian i by a vote of its neighbors; the refined direction is directions[source[i]].
 
     Let N be the K nearest neighbors of i, and N+ these neighbors and i itself::
 
@@ -113,7 +113,7 @@ def refine(
 
 
 def labeled_share(evidence: Evidence) -> Float64[Tensor, " n"]:
-    """Return the share of every Gaussian's weight, over all views, that lies in regions; 1 without weight."""
+    """Return the share of every Gaussian's weight, over all views, that lies in regions, or 1 without weight."""
     labeled, blank = evidence.rows.row_sums(), evidence.unlabeled.row_sums()
     return torch.where(labeled + blank > 0, labeled / (labeled + blank), 1.0)
 
@@ -134,7 +134,7 @@ def _check_inputs(
 
 @dataclass(frozen=True)
 class _VoteInputs:
-    """Inputs that all blocks of a vote share."""
+    """Inputs shared by all blocks of a vote."""
 
     neighbors: Neighbors
     reliability: Float[Tensor, " n"]
@@ -159,7 +159,8 @@ def refine_subset(
     """Run `refine` for some of the first m Gaussians. The other Gaussians only serve as neighbors.
 
     Args:
-        voters: Indices of the Gaussians to refine, in processing order. Neighbors in space should be close in it.
+        voters: Indices of the Gaussians to refine, in processing order. Neighbors in space should be close to
+            each other in this order.
         neighbors: Neighbors of the first m Gaussians, which include all voters.
         directions, reliability: As in `refine`, for all n Gaussians.
         own: As in `refine`, used for voters only, or None for the paper's vote.
@@ -434,7 +435,7 @@ def shared_views(
     second: Int64[Tensor, " p"],
     level: Int64[Tensor, " s"] | None = None,
 ) -> tuple[Float64[Tensor, " p"], Float64[Tensor, " p"]]:
-    """Return, for every pair, the number of views in which both share a region, and of views with regions of both.
+    """Return, for every pair, the numbers of views with a shared region and of views with regions of both Gaussians.
 
     A Gaussian may lie in several regions of a view. The first number then counts the view with the probability that
     both Gaussians lie in the same region.

@@ -25,11 +25,11 @@ PROMPT_BLOCK = 32
 _SAMPLED = 16
 """Sampling step of `_largest`, which takes every 16th value as a sample."""
 TOP_QUANTILE = 0.999
-"""Quantile of the relevancies of all Gaussians to use as the top relevancy of a prompt. It is robust to outliers."""
+"""Quantile over Gaussians that defines the top relevancy of a prompt. It is robust to outliers."""
 _LARGEST_COSINE = 1.01
 """Largest accepted absolute value of a cosine. In half precision, rounding errors of cosines are about 0.001."""
 _PRESENT = 0.62
-"""Relevancy by the rule "lerf" that objects in a scene usually reach."""
+"""Relevancy by the rule "lerf" that prompts for objects in the scene usually reach."""
 
 
 class RuleSettings(NamedTuple):

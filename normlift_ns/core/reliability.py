@@ -27,8 +27,8 @@ from torch import Tensor
 from normlift_ns.core.sparse import SparseRows
 
 DRIFT = 21.7
-"""Angle in degrees at which the correlation between features of the same object part falls to 1/e, measured on real
-images."""
+"""Angle between two views, in degrees, at which the correlation between their features of the same object part falls to
+1/e, measured on real images."""
 LEAST_RELIABILITY = 0.02
 """r, the R of a Gaussian in a single view if beta > 0. It is positive, because R = 0 means no evidence."""
 _CHUNK_ELEMENTS = 2**22

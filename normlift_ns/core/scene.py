@@ -15,8 +15,8 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.options import RasterizeMode
 
 _TOLERANCE = 1e-5
-"""Relative tolerance within which two numbers of a camera summary count as equal. For values near zero,
-the absolute tolerance is a tenth of it."""
+"""Relative tolerance within which two numbers of a camera summary count as equal. A tenth of it is added as an absolute
+tolerance, for numbers near zero."""
 
 
 @check_arguments
@@ -168,9 +168,9 @@ class Scene(Protocol):
 
 
 def camera_summary(cameras: Sequence[Camera]) -> list[float]:
-    """Return numbers that summarize cameras, for a manifest.
+    """Summarize cameras as a list of numbers for a manifest.
 
-    They are the number of cameras, and weighted means of size, intrinsics and pose. The weights increase
+    The numbers are the number of cameras, and weighted means of size, intrinsics and pose. The weights increase
     from 1 for the first camera to 2 for the last, so that the order of the cameras also matters.
 
     >>> import torch

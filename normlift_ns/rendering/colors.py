@@ -31,7 +31,7 @@ blindness.
 RELIABILITY_COLORMAP: Colormap = "cividis"
 """Colormap of the reliability R, always over the range 0 to 1."""
 MIN_OVERLAY_OPACITY, MAX_OVERLAY_OPACITY = 0.35, 0.9
-"""Opacity over the scene at the lowest and the highest selected relevancy."""
+"""Opacity of the overlay at the first and the last color of its scale."""
 _OKABE_ITO = ("e69f00", "56b4e9", "009e73", "f0e442", "0072b2", "d55e00", "cc79a7")
 _MIN_SATURATION = 0.3
 """Minimum saturation of a named color for use as the prompt's color, because unselected Gaussians are gray."""
@@ -90,8 +90,8 @@ def named_color(text: str) -> tuple[float, float, float] | None:
 def prompt_colors(texts: Sequence[str]) -> Float[Tensor, "q 3"]:
     """Return a color for each prompt, RGB in 0..1.
 
-    It is the color that the prompt names, unless an earlier prompt has this color. Otherwise, it is distinguishable
-    from the other colors.
+    A prompt gets the color that it names. If it names no saturated color, or an earlier prompt has the same color, it
+    gets a distinguishable one.
 
     >>> (prompt_colors(["fox", "sky blue", "sky blue bowl"]) * 255).round().int().tolist()
     [[230, 159, 0], [117, 187, 253], [0, 158, 115]]
@@ -198,7 +198,7 @@ def _font_size(height: int) -> int:
 
 
 def _paste(image: Tensor, tile: UInt8[np.ndarray, "rows columns 3"], width: int) -> Tensor:
-    """Paste a tile into the lower right corner of an image, if a third of the image width stays free."""
+    """Paste a tile into the lower right corner of an image, if it fits and leaves a third of the width free."""
     rows, columns = tile.shape[:2]
     margin = max(4, rows // 8)
     if 3 * columns > 2 * width or columns + 2 * margin > width or rows + 2 * margin > len(image):

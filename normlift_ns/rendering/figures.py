@@ -157,8 +157,8 @@ def render_outputs(
 ) -> dict[str, Tensor]:
     """Return the semantic outputs of one image by name, each [H, W, 1] or [H, W, 3], the overlay last.
 
-    The outputs overlay, segmentation and reliability are color images on a gray render of the scene. The other outputs
-    are scalars sum_j A_ij value_j, 0 for empty pixels, except for relevancies with `named_by_text`.
+    The outputs overlay, segmentation and reliability, and the relevancies if `named_by_text` is True, are color images
+    on a gray render of the scene. The other outputs are scalars sum_j A_ij value_j, which are 0 for empty pixels.
 
     Args:
         rgb: Rendered scene, RGB in 0..1.
@@ -234,7 +234,7 @@ def segmentation(
 def reliability_map(
     rgb: Float[Tensor, "h w 3"], reliability: Float[Tensor, "h w 1"], alpha: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """Return a map of the reliability R on a fixed scale from 0 to 1, with a legend.
+    """Return a map of the reliability R on a fixed scale from 0 to 1, with a color bar if there is enough space.
 
     Args:
         reliability: Composited reliability, not divided by `alpha`.
@@ -375,7 +375,7 @@ def _outlined(overlay: Tensor, selected: Tensor, width: int) -> Image.Image:
 def _page(
     sheet: FigureStyle, titles: Sequence[str], panels: Sequence[Image.Image], captions: Sequence[str], columns: int
 ) -> Image.Image:
-    """Lay out panels in rows of `columns`, with titles above and the color bar below."""
+    """Lay out panels in rows of `columns` panels, with titles above and the color bar below."""
     columns, line, small = min(columns, len(panels)), round(1.5 * _FONT_SIZE), colors.load_font(_FONT_SIZE - 4)
     width, height = (max(panel.size[i] for panel in panels) for i in (0, 1))
     rows = math.ceil(len(panels) / columns)
@@ -609,7 +609,7 @@ def save_inventory(
 
 
 def _numbered(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "m h w"], names: Sequence[str]) -> Image.Image:
-    """Draw the outline of every mask, with its number and name at the pixel that has the most mask pixels around it."""
+    """Draw the outline of every mask, and its number and name at the mask pixel with the most mask pixels around it."""
     height, width = image.shape[:2]
     line = max(1, round(max(height, width) * _OUTLINE_FRACTION))
     canvas, size = image.clone().cpu(), max(12, max(height, width) // 40)
@@ -642,7 +642,7 @@ def write_masks(
     settings: RasterSettings | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write one PNG mask per training image, of the same size: 255 for the pixels of `view_mask`, 0 for others.
+    """Write one PNG mask per training image, of the same size, with 255 for the pixels of `view_mask` and 0 for others.
 
     If an error occurs, no file is written. Objects in front of the selection occlude it. The masks match the
     undistorted images that the training used.
