@@ -198,7 +198,7 @@ def apply_consensus(
     """Return F', the features of the regions of one level after the consensus.
 
     All regions keep their features if the agreement B is at most `least`. A region also keeps its feature if the
-    feature is zero, the region has no overlaps, or the sum of the features nearly vanishes.
+    feature is zero, the region has no overlaps, or the weighted sum nearly vanishes.
     """
     strength = min(1.0, max(0.0, (overlaps.agreement - least) / AGREEMENT_RAMP))
     if strength == 0 or overlaps.iou.weight.numel() == 0:

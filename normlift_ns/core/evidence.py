@@ -75,7 +75,7 @@ class Evidence(TensorRecord):
     weight_power: int = 1
     """Exponent of A_ij in E. The paper uses 1, and the code of Splat Feature Solver uses 2. With 0, E counts pixels."""
     num_excluded: int = 0
-    """Number of Gaussians that were not drawn because a parameter was not finite or out of range."""
+    """Number of Gaussians that were not drawn because a parameter was out of range or not finite."""
 
     def __post_init__(self) -> None:
         offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight

@@ -39,8 +39,8 @@ from normlift_ns.io.run_dir import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, wr
 from normlift_ns.options import RelevancyRule, Storage
 
 CHANGED_COSINE = 0.98
-"""Cosine between the directions before and after the vote below which a Gaussian counts as changed. It corresponds to
-about 11 degrees."""
+"""Limit on the cosine between the directions of a Gaussian before and after the vote. A Gaussian below the limit, which
+corresponds to about 11 degrees, counts as changed."""
 
 
 @check_arguments

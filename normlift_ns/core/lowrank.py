@@ -173,7 +173,7 @@ def encode_directions(
     processes.
 
     Args:
-        blocks: Rows of the lift that are encoded together.
+        blocks: Row indices in the lift. The rows of each block are encoded together.
     """
     dimension = lifted.features.shape[1] if basis is None else len(basis)
     mask, coordinates = lifted.scalars.norm > 0, [lifted.features.new_zeros(0, dimension, dtype=torch.float16)]
@@ -209,7 +209,7 @@ def arrange_directions(
 def sizes_and_bounds(
     lifted: Lifted, basis: Basis | None, portion: Partition | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Return the size in bytes of each storage form, without scalars and source, and its bound on the cosine error.
+    """Return the size in bytes (without scalars and source) and the bound on the cosine error of each storage form.
 
     Args:
         basis: Basis of the form "low_rank", or None to leave this form out.

@@ -64,8 +64,8 @@ def nearest_neighbors(
     The CPU uses a k-d tree of the distinct positions, because any number of Gaussians may share a position. The GPU
     uses `kernels.nearest` for float32 means and K up to 60. A row of its result is uncertain if a Gaussian that the
     search dropped could be as near as the last neighbor. For up to 1,000 uncertain rows, the GPU computes all
-    distances. If there are more, the CPU repeats the search. A Gaussian whose mean is not finite has no neighbors and
-    is not a neighbor of others.
+    distances of these rows. If there are more, the CPU repeats the search. A Gaussian whose mean is not finite has no
+    neighbors and is not a neighbor of others.
 
     Args:
         of: Distinct indices of the Gaussians to find neighbors for, one per row of the result (default: all n).

@@ -254,7 +254,10 @@ def _vote(inputs: _VoteInputs, voters: Tensor, directions: Tensor, row_of: Tenso
 
 
 def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64[Tensor, ""]:
-    """Return sigma_d times the median spacing, in the units of the means, or sigma_d if no spacing is finite."""
+    """Return sigma_d in the units of the means: the option `sigma_d` times the median spacing.
+
+    If no spacing is finite, return the option itself.
+    """
     finite = spacing[spacing.isfinite()]
     sigma = config.numbers.sigma_d
     if finite.numel() == 0:
@@ -477,7 +480,7 @@ def relative_gate(cosines: Float64[Tensor, " q"], quantile: float = GATE_QUANTIL
 
 
 def _shares(rows: SparseRows, group: Int64[Tensor, " s"]) -> tuple[Int64[Tensor, " g"], Float64[Tensor, " nnz"]]:
-    """Return the ascending keys of all (row, group) pairs, and the share of every entry in the weight of its pair."""
+    """Return the sorted keys of (row, group) pairs with entries, and the share of every entry in its pair's weight."""
     key = rows.row_index() * (int(group.max()) + 1) + group[rows.column.long()]
     seen, total = sum_equal_keys(key, rows.weight.double())
     return seen, rows.weight.double() / total.clamp(min=1e-30)[torch.searchsorted(seen, key)]

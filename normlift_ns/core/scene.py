@@ -170,8 +170,8 @@ class Scene(Protocol):
 def camera_summary(cameras: Sequence[Camera]) -> list[float]:
     """Summarize cameras as a list of numbers for a manifest.
 
-    The numbers are the number of cameras, and weighted means of size, intrinsics and pose. The weights increase
-    from 1 for the first camera to 2 for the last, so that the order of the cameras also matters.
+    The list contains the number of cameras, and weighted means of size, intrinsics and pose. The weights increase from
+    1 for the first camera to 2 for the last, so that the order of the cameras also matters.
 
     >>> import torch
     >>> left = Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)

@@ -31,7 +31,7 @@ _MAX_SORTED = 2**27
 def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float64[Tensor, " rows"]:
     """Return the sums of the segments values[offsets[i]:offsets[i + 1]] in float64, or 0 for empty segments.
 
-    Each segment is summed separately, so a value of 1e-12 in one segment is not lost next to 1e6 in another.
+    Each segment is summed separately, so 1e-12 in one segment is not lost next to 1e6 in another.
 
     >>> segment_sum(torch.tensor([1.0, 2.0, 4.0]), torch.tensor([0, 2, 2, 3])).tolist()
     [3.0, 0.0, 4.0]
@@ -196,7 +196,7 @@ class SparseRows(TensorRecord):
             yield first, SparseRows(offsets - low, self.column[low:high], self.weight[low:high])
 
     def sums_of_unit_rows(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
-        """Return the product with a table of unit rows, in which all sums have accurate directions.
+        """Return the product with a table of unit rows, with an accurate direction of every row of the result.
 
         Sums that nearly cancel and sums of more than `MANY_ENTRIES` rows are recomputed in float64.
         """
