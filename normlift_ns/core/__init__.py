@@ -1,1 +1,1 @@
-"""The method on plain tensors. It needs torch, numpy, scipy and safetensors, but not nerfstudio."""
+"""Implementation of the method on plain tensors, independent of nerfstudio."""

@@ -27,13 +27,13 @@ from normlift_ns.options import check_path, short_repr
 
 _T = TypeVar("_T")
 _Sizes = dict[str, Any]
-"""Length of each named axis in the arguments that were checked so far."""
+"""Length of each named axis in the arguments checked so far."""
 _Check = Callable[[str, Any, _Sizes], Any]
-"""Function that checks an argument, given its name, value and axis lengths, and returns the converted value."""
+"""Function that takes the name and value of an argument and the known axis lengths, and returns the converted value."""
 
 
 def check_arguments(target: _T) -> _T:
-    """Decorate a function, dataclass or NamedTuple to check its arguments against their annotations at every call.
+    """Decorate a function, dataclass or NamedTuple to check its arguments against their annotations on every call.
 
     >>> @check_arguments
     ... def double(number: int, word: Literal["twice"] = "twice") -> int:
@@ -65,7 +65,7 @@ def check_arguments(target: _T) -> _T:
 
 
 def _checks_of(owner: Any, function: Any) -> tuple[Callable[[], Iterable[tuple[str, _Check]]], dict[str, _Check]]:
-    """Return a function that lists (name, check) pairs of positional arguments, and the checks of arguments by name."""
+    """Return a function that yields (name, check) pairs for positional arguments, and a dictionary of all checks."""
     hints = get_type_hints(owner, localns=cast(Any, _Names(sys.modules[owner.__module__].__dict__)))
     named, ordered, more = dict[str, _Check](), list[tuple[str, _Check]](), ("", _anything)
     for p in inspect.signature(function).parameters.values():
@@ -85,7 +85,7 @@ def check_rows(name: str, rows: Any, size: int, low: int = 0) -> None:
 
     Args:
         size: Number of rows.
-        low: Smallest valid index, -1 if -1 marks a missing row.
+        low: Smallest valid index; -1 if missing rows are marked by -1.
     """
     if rows.numel() == 0:
         return
@@ -241,7 +241,11 @@ def _mapping_check(item: _Check) -> _Check:
 
 
 def _function_check(parts: Sequence[Any]) -> _Check:
-    """Return the check of a function's number of parameters and, at every call, of an array that it returns."""
+    """Return the check for a function.
+
+    It checks the number of parameters. If the function must return an array, every call checks the arguments and the
+    result.
+    """
     arguments, result = [_check_of(hint) for hint in parts[0]], _check_of(parts[1])
 
     def check(name: str, value: Any, sizes: _Sizes) -> Any:
@@ -265,7 +269,7 @@ def _function_check(parts: Sequence[Any]) -> _Check:
 
 
 class _ArrayCheck:
-    """Check for a jaxtyping annotation: number type, number of axes, and their lengths."""
+    """Check for a jaxtyping annotation: data type, number of axes, and length of every axis."""
 
     def __init__(self, hint: Any) -> None:
         self.kind, axes = hint.__name__.partition("[")[0].rstrip("0123456789"), hint.dim_str.split()
@@ -313,7 +317,7 @@ def _kind_of(dtype: Any) -> str:
 
 
 def _layout(value: Any) -> str | None:
-    """Return the name of a tensor's layout if it is unsupported, "" for a usable array, or None for other values."""
+    """Return the layout of a tensor if it is unsupported, "" for a usable tensor or array, or None for other values."""
     torch = sys.modules.get("torch")
     if torch is None or not isinstance(value, torch.Tensor):
         return "" if isinstance(value, np.ndarray) else None
@@ -322,7 +326,7 @@ def _layout(value: Any) -> str | None:
 
 
 def as_tensor(name: str, value: Any, expected: str) -> Any:
-    """Return a tensor, array or nested list as a tensor, or raise ArgumentError with `expected` in the message."""
+    """Convert a tensor, array or nested list to a tensor, or raise ArgumentError with `expected` in the message."""
     if not isinstance(value, np.ndarray | list | tuple):
         if (layout := _layout(value)) is None:
             raise _error(name, expected, value)

@@ -1,12 +1,12 @@
 """Consensus of regions across views, computed before the lift.
 
-An error in a 2D feature affects its whole region in one view, so neighboring Gaussians share it. Regions of other views
-that cover the same Gaussians usually do not have this error. The consensus therefore moves each feature toward those of
-overlapping regions in other views. Let E be the evidence and F_s the feature of region s. Let W_jv(s) be the weight of
-Gaussian j in the view of s, including pixels without a region. Let t be a region of another view v. Sums over j run
+An error in a 2D feature affects its whole region in one view, so neighboring Gaussians have the same error. Regions of
+other views that cover these Gaussians usually do not have it. The consensus therefore moves each feature toward those
+of overlapping regions in other views. Let E be the evidence and F_s the feature of region s. Let W_jv(s) be the weight
+of Gaussian j in the view of s, including pixels without a region. Let t be a region of another view v. Sums over j run
 over the Gaussians that are visible in both views::
 
-    p_js = E_js / W_jv(s)                                        share of j that lies in s, 0 if below 0.02
+    p_js = E_js / W_jv(s)                                        share of the weight of j in s, 0 if below 0.02
     c_st = sum_j p_js p_jt / sum_j p_js                          share of s that lies in t
     J_st = 1 / (1 / c_st + 1 / c_ts - 1)                         soft intersection over union, symmetric, in 0..1
     B    = sum_sv a_sv max_{t in v} J_st / sum_sv a_sv           weighted mean of the best overlaps
@@ -48,11 +48,11 @@ MIN_OVERLAP = 0.1
 MIN_VISIBILITY = 0.5
 """Smallest weight of a visible Gaussian, as a share of the median weight of the Gaussians in the same view."""
 CHANCE_AGREEMENT, AGREEMENT_RAMP = 0.4, 0.1
-"""Largest B of regions that overlap by chance, and the further increase of B at which b(B) reaches 1."""
+"""Largest B of regions that overlap by chance, and the additional increase of B over which b(B) rises to 1."""
 MIN_SHARE = 0.02
 """Smallest p_js that counts. Smaller shares are set to 0."""
 SAMPLING_SEED = 0
-"""Seed of the pseudo-random order in which Gaussians are sampled."""
+"""Seed of the pseudo-random numbers of `hash_to_unit`."""
 _MEDIAN_SAMPLE = 2**16
 """Approximate number of weights in the sample for medians."""
 _MAX_PRODUCTS, _MAX_DENSE = 2**25, 2**26
@@ -86,11 +86,11 @@ class Consensus(NamedTuple):
     """
 
     features: Float[Tensor, "s d"]
-    """F', the features after the consensus, as unit rows; rows that are 0 in F, the features before it, stay 0."""
+    """F', the features after the consensus, as unit rows. Zero rows of the input stay zero."""
     agreement: list[float]
     """B of every level, in ascending order of the levels. B is the weighted mean of the best overlaps, in 0..1."""
     gaussians: int
-    """Number of Gaussians sampled."""
+    """Number of sampled Gaussians."""
 
 
 @check_arguments
@@ -106,10 +106,10 @@ def consensus(
     """Compute F', the features of all regions after the consensus, with the formulas at the top of this module.
 
     Args:
-        features: Unit rows or 0, one per column of the evidence.
+        features: F, unit or zero rows, one per column of the evidence.
         level: Level of every region (default: the same for all). Regions of different levels are not compared.
         power: q, the exponent of c_ts, >= 0.
-        sample: Smallest number of Gaussians to sample in a region, >= 1. Smaller regions use all their Gaussians.
+        sample: Minimum number of Gaussians to sample in each region, >= 1. Regions with fewer use all of them.
         least: Largest B that regions reach by chance, in 0..1. Up to this B, regions keep their features.
     Raises:
         ValueError: If `features` or `level` has the wrong length, a feature is neither a unit vector nor 0, or another
@@ -132,7 +132,7 @@ def consensus(
 
 
 def check_consensus_inputs(size: int, features: Tensor, level: Tensor | None) -> None:
-    """Raise ValueError if the features or levels do not fit evidence of `size` regions."""
+    """Raise ValueError if the features or levels are invalid, or do not have one row per region of the evidence."""
     for name, length in (("features", len(features)), ("level", size if level is None else len(level))):
         if length != size:
             raise InputError(f"{name} must have one row per region of the evidence ({size:,}), got {length:,}")
@@ -183,11 +183,11 @@ def sampled_consensus(
 
 
 def with_original_reliability(scalars: Scalars, original: Scalars) -> Scalars:
-    """Return the scalars of the lift of F' with the R of the lift of F, or R = 0 if F' gives no direction.
+    """Return `scalars` with the reliability R of `original`, or R = 0 for Gaussians without a direction in `scalars`.
 
     Args:
-        scalars: Scalars of the lift of F'.
-        original: Scalars of the lift of F.
+        scalars: Scalars of the lift of F', the features after the consensus.
+        original: Scalars of the lift of F, the features before the consensus.
     """
     return replace(scalars, reliability=torch.where(scalars.norm > 0, original.reliability, 0.0))
 
@@ -195,8 +195,11 @@ def with_original_reliability(scalars: Scalars, original: Scalars) -> Scalars:
 def apply_consensus(
     features: Float[Tensor, "s d"], overlaps: Overlaps, power: float = 1.0, least: float = CHANCE_AGREEMENT
 ) -> Float[Tensor, "s d"]:
-    """Return F', the features after the consensus, for the regions of one level. Regions without overlaps or without a
-    direction keep their rows of F."""
+    """Return F', the features of the regions of one level after the consensus.
+
+    All regions keep their features if the agreement B is at most `least`. A region also keeps its feature if the
+    feature is zero, the region has no overlaps, or the weighted sum nearly vanishes.
+    """
     strength = min(1.0, max(0.0, (overlaps.agreement - least) / AGREEMENT_RAMP))
     if strength == 0 or overlaps.iou.weight.numel() == 0:
         return features
@@ -214,9 +217,9 @@ def sample_gaussians(
 ) -> tuple[Int64[Tensor, " m"], Float64[Tensor, " m"]]:
     """Sample Gaussians until every region has at least `least` of them, or all of its Gaussians.
 
-    Each Gaussian has a pseudo-random number in [0, 1) that depends only on its index. A region samples its Gaussians
-    with a number below a limit, which is doubled as long as they are too few. Sums over the sample are unbiased if
-    every term is divided by its sampling probability.
+    Each Gaussian has a pseudo-random number in [0, 1) that depends only on its index. A region samples those of
+    its Gaussians whose numbers are below a limit, and doubles the limit until the sample is large enough. Sums over the
+    sample estimate sums over all Gaussians if every term is divided by the sampling probability of its Gaussian.
 
     Args:
         portion: Partition of the Gaussians, if several processes lift the scene. `rows` then covers the Gaussians of
@@ -264,8 +267,9 @@ def region_overlaps(
     Args:
         rows: E, [M, S].
         region_view: Index of the view of every column, in non-decreasing order.
-        probability: Sampling probability of every row (default: 1, if the rows are not a sample).
-        total: W_jv, [M, views], including pixels without a region (default: all pixels have a region).
+        probability: Sampling probability of every row (default: 1, for rows that are not a sample).
+        total: W_jv, [M, views], including pixels without a region (default: the weights in `rows`, as if all
+            pixels had a region).
     """
     size, view = len(region_view), region_view.long()
     last = [x.max() for x in (view, *(() if total is None else (total.column,))) if len(x) > 0]
@@ -294,7 +298,7 @@ def region_overlaps(
 
 
 def hash_to_unit(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
-    """Return a pseudo-random number in [0, 1) for every index, computed by the finalizer of MurmurHash3."""
+    """Return a pseudo-random number in [0, 1) for every index, computed with the finalizer of MurmurHash3."""
     x = index + SAMPLING_SEED
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         x = ((x ^ (x >> shift)) * factor) & 0xFFFFFFFF
@@ -302,7 +306,7 @@ def hash_to_unit(index: Int64[Tensor, " n"]) -> Float64[Tensor, " n"]:
 
 
 def _largest_share(rows: SparseRows, share: Float64[Tensor, " s"]) -> Float64[Tensor, " n"]:
-    """Return the largest share among the columns of every row, or 0 for an empty row."""
+    """Return the largest value of `share` over the columns that occur in each row, or 0 for an empty row."""
     if can_use_triton(share):
         from normlift_ns.kernels.sparse import row_max  # noqa: PLC0415 (needs triton)
 
@@ -319,12 +323,12 @@ def _shares(
 ) -> tuple[SparseRows, SparseRows, SparseRows]:
     """Return the shares of Gaussians in regions, and the views in which they are visible.
 
-    All values are divided by the square root of the Gaussian's sampling probability. Sums of their products therefore
-    estimate the sums over all Gaussians.
+    All values are divided by the square root of the Gaussian's sampling probability. Sums of products of two values
+    therefore estimate the sums over all Gaussians.
 
     Returns:
-        The shares p_js of visible Gaussians [M, S]; a matrix with 1 for every view that shows a Gaussian [M, views];
-        and the sum of the shares in every view [M, views].
+        The shares p_js of visible Gaussians [M, S]; a matrix with 1 for every view in which a Gaussian is
+        visible [M, views]; and the sums of p_js over the regions of every view [M, views].
     """
     group_of_entry, group_row, group_view, weight = _group_by_view(rows, view, views)
     if total is None:
@@ -373,8 +377,9 @@ def _medians(values: Float64[Tensor, " m"], group: Int64[Tensor, " m"], groups: 
 
 
 _Block = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Sums for a block of regions s. The first two, [regions, views], are sum_j p_js over visible Gaussians and a_sv. The
-others are s, t and sum_j p_js p_jt for regions t of other views with c_st >= `MIN_OVERLAP`."""
+"""Sums for a block of regions s. The first tensor, [regions, views], is the sum of p_js over the Gaussians that are
+visible in each view, and the second is a_sv. The others are s, t and sum_j p_js p_jt for regions t of other views with
+c_st >= `MIN_OVERLAP`."""
 
 
 def _inner_products(

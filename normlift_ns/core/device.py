@@ -29,7 +29,7 @@ Record = TypeVar("Record")
 
 
 class shared_property(cached_property[Result]):
-    """A `cached_property` for use by several threads. One thread computes the value, and the others wait for it."""
+    """A thread-safe `cached_property`. One thread computes the value, and the others wait for it."""
 
     def __init__(self, function: Callable[[Any], Result]) -> None:
         super().__init__(function)
@@ -41,10 +41,10 @@ class shared_property(cached_property[Result]):
 
 
 class TensorRecord:
-    """Base class of dataclasses whose fields are tensors, other such dataclasses, or values without a device."""
+    """Base class for dataclasses whose fields are tensors, other such dataclasses, or values without a device."""
 
     def to(self: Record, device: torch.device | str) -> Record:
-        """Return a copy on another device."""
+        """Return a copy with all tensors on the given device."""
         record = cast(Any, self)  # the subclasses are dataclasses
         values = {field.name: getattr(record, field.name) for field in fields(record)}
         return replace(record, **{name: x.to(device) for name, x in values.items() if hasattr(x, "to")})
@@ -52,9 +52,9 @@ class TensorRecord:
 
 @cache
 def has_triton() -> bool:
-    """Return True if Triton 3 or newer is installed, or a Triton whose version is unknown.
+    """Return True if Triton is installed and its version is at least 3 or unknown.
 
-    torch 2.4 and later on Linux include it. Without Triton, the default backend on a GPU is gsplat or torch.
+    On Linux, torch 2.4 and later install Triton 3. Without Triton, the default backend on a GPU is gsplat or torch.
     """
     if find_spec("triton") is None:
         return False
@@ -94,7 +94,7 @@ def retry_in_halves(run: Callable[[Items], Result], items: Items, advice: str) -
 def init_cuda(device: str) -> None:
     """Initialize CUDA and Triton in background threads if the device is a GPU. Both take about a second.
 
-    Errors are ignored here. They occur again at the first use of the GPU.
+    Errors are ignored here, because they occur again when the GPU is first used.
     """
 
     def start() -> None:
@@ -109,10 +109,10 @@ _triton_lock = Lock()
 
 
 def load_triton() -> None:
-    """Compute the hash of Triton's files and load its driver, once in this process. All Triton kernels need both.
+    """Compute the hash of Triton's files and load its driver, once per process. All Triton kernels need both.
 
     Without the lock, every thread that compiles a kernel would compute the hash and compile the driver. Errors are
-    ignored here. They occur again in the first kernel.
+    ignored here, because they occur again when the first kernel is compiled.
     """
     with _triton_lock, suppress(Exception):
         if has_triton():
@@ -144,7 +144,7 @@ def choose_device(device: str) -> str:
 
 
 def prefetch_map(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """Yield the results of `map(function, items)`, and compute up to `threads` of the next ones in the background.
+    """Yield the results of `map(function, items)` while computing up to `threads` further results in the background.
 
     The caller's thread iterates over `items`. Exceptions are raised in the order of the items. With one thread, nothing
     is prefetched.
@@ -183,7 +183,7 @@ class AdaptiveBatches:
     """Number of items per batch."""
 
     def __call__(self, function: Callable[[Items], Result], items: Items) -> Iterator[Result]:
-        """Yield the results of the function on consecutive batches of items.
+        """Yield the results of the function for consecutive batches of items.
 
         Raises:
             MemoryError: If a single item does not fit into GPU memory.
@@ -209,7 +209,7 @@ class AdaptiveBatches:
         """Yield the result rows of each part, one row per item. A batch may contain items of several parts.
 
         The last batch is padded with copies of its last item. All batches therefore have the same shape, unless the
-        batch size is reduced. The result row of an item depends on the other items of its batch only by rounding.
+        batch size is reduced. The result row of an item depends on the other items of its batch only through rounding.
 
         The next part is requested when a batch has room for more items. The rows of a part are yielded together, after
         all of them are computed.

@@ -50,7 +50,7 @@ class Evidence(TensorRecord):
 
     E_js is the sum of A_ij ** weight_power over the pixels i of region s. A_ij is the compositing weight of Gaussian j
     in pixel i. Columns s number the regions of all views consecutively, like the rows of the feature table. The columns
-    of a row ascend. The constructor raises ValueError if the arrays are inconsistent.
+    of every row are in ascending order. The constructor raises ValueError if the arrays are inconsistent.
 
     >>> import torch
     >>> from normlift_ns import Evidence
@@ -75,7 +75,7 @@ class Evidence(TensorRecord):
     weight_power: int = 1
     """Exponent of A_ij in E. The paper uses 1, and the code of Splat Feature Solver uses 2. With 0, E counts pixels."""
     num_excluded: int = 0
-    """Number of Gaussians that were not drawn because a parameter was not finite or out of range."""
+    """Number of Gaussians that were not drawn because a parameter was out of range or not finite."""
 
     def __post_init__(self) -> None:
         offsets, column, weight = self.rows.offsets, self.rows.column, self.rows.weight
@@ -123,8 +123,8 @@ class Evidence(TensorRecord):
         """Build evidence from the entries of all views, in the given order.
 
         Raises:
-            ValueError: If a number is out of range, such as a `num_gaussians` that is not in 0..2**31 - 1. Also if
-                entries are not distinct and sorted, or have invalid indices, or negative or non-finite weights.
+            ValueError: If a count or `weight_power` is out of range (`num_gaussians`: 0..2**31 - 1). Also if entries
+                are not distinct and sorted, have invalid indices, or have negative or non-finite weights.
         """
         if not 0 <= num_gaussians < 2**31:
             raise InputError(f"num_gaussians must be in 0..2147483647, got {num_gaussians}")
@@ -134,7 +134,7 @@ class Evidence(TensorRecord):
 
     @staticmethod
     def join(parts: Sequence[Entries], num_gaussians: int, *, weight_power: int, num_excluded: int) -> Evidence:
-        """Build evidence as `from_entries` does, but without checking the entries."""
+        """Build evidence like `from_entries`, but without checking the entries."""
         device = parts[0].weight.device if parts else torch.device("cpu")
         counts = [count for part in parts for count in part.num_regions]
         rows, unlabeled = (_join_by_sorting if device.type == "cuda" else _join)(parts, num_gaussians, device)
@@ -154,7 +154,7 @@ class Evidence(TensorRecord):
     def view_weights(self) -> SparseRows:
         """Return W_jv, the weight of Gaussian j in the labeled pixels of view v.
 
-        The result is [N, views] in float64, with one entry per pair that has evidence.
+        The result is [N, views] in float64, with one entry per (Gaussian, view) pair that has evidence.
         """
         groups = self.view_group_offsets
         view = self.region_view[self.rows.column[groups[:-1]].long()]
@@ -178,7 +178,7 @@ class Evidence(TensorRecord):
 
     @check_arguments
     def select_views(self, views: Sequence[int] | Int[Tensor, " m"]) -> Evidence:
-        """Return the evidence of some views, renumbered in the given order.
+        """Return the evidence of the given views, renumbered in the order of `views`.
 
         Raises:
             ValueError: If a view does not exist or occurs twice.
@@ -194,9 +194,9 @@ class Evidence(TensorRecord):
 
     @check_arguments
     def select_gaussians(self, gaussians: Int[Tensor, " m"]) -> Evidence:
-        """Return the evidence of some Gaussians, in the given order.
+        """Return the evidence of the given Gaussians, in the order of `gaussians`.
 
-        `num_excluded` is kept, but limited to the number of these Gaussians.
+        `num_excluded` is kept, but capped at the number of given Gaussians.
 
         Raises:
             ValueError: If a Gaussian does not exist.
@@ -275,7 +275,7 @@ class Evidence(TensorRecord):
     def save(
         self, path: str | Path, *, key: str = "", remarks: Mapping[str, str] | None = None, own: bool = False
     ) -> str:
-        """Write a safetensors file atomically, replacing an earlier one, and return its digest.
+        """Write the evidence to a safetensors file atomically, replacing any existing file, and return its digest.
 
         Args:
             key: Cache key, which is part of the digest.
@@ -299,7 +299,7 @@ class Evidence(TensorRecord):
     @staticmethod
     @check_arguments
     def load(path: str | Path, *, key: str = "") -> Evidence:
-        """Read a file that `save` wrote.
+        """Read a file written by `save`.
 
         Args:
             key: The key passed to `save`. With a key, files of version 0.1 are rejected, because they have no digest.
@@ -316,13 +316,15 @@ class Evidence(TensorRecord):
 
     @staticmethod
     def of_arrays(arrays: EvidenceArrays) -> Evidence:
-        """Wrap the arrays of a file as tensors without copying them."""
+        """Build evidence from the arrays of a file without copying them."""
         rows, unlabeled = (SparseRows(*map(torch.from_numpy, part)) for part in (arrays.rows, arrays.unlabeled))
         return Evidence(rows, torch.from_numpy(arrays.region_view), unlabeled, *arrays.counts)
 
 
 def check_not_negative(name: str, values: Tensor) -> None:
-    """Raise ValueError with the number of invalid values and the first one if a value is negative or not finite.
+    """Raise ValueError if a value is negative or not finite.
+
+    The message gives the number of invalid values and the first of them.
 
     >>> check_not_negative("reliability", torch.tensor([0.0, 1.0]))
     """

@@ -39,16 +39,14 @@ from normlift_ns.io.run_dir import LIFT_AGAIN, MANIFEST_FILE, SCHEMA_VERSION, wr
 from normlift_ns.options import RelevancyRule, Storage
 
 CHANGED_COSINE = 0.98
-"""Limit on the cosine between the directions of a Gaussian before and after the vote, about 11 degrees.
-
-Below the limit, the Gaussian counts as changed.
-"""
+"""Limit on the cosine between the directions of a Gaussian before and after the vote. A Gaussian below the limit, which
+corresponds to about 11 degrees, counts as changed."""
 
 
 @check_arguments
 @dataclass(frozen=True)
 class SemanticField(TensorRecord):
-    """Semantics of N Gaussians: scalars, the refinement as an index, and directions in one of three storage forms.
+    """Semantics of N Gaussians: scalars, refinement as indices, and directions in one of three storage forms.
 
     >>> import torch
     >>> from normlift_ns import Evidence, SemanticField, lift
@@ -63,8 +61,8 @@ class SemanticField(TensorRecord):
 
     scalars: Scalars
     source: Int32[Tensor, " n"]
-    """Index of the Gaussian whose direction Gaussian i takes in the refinement; source[i] = i if i keeps its own
-    direction."""
+    """Index of the Gaussian whose direction each Gaussian takes in the refinement; source[i] = i if Gaussian i keeps
+    its own direction."""
     store: StoredEvidence | StoredDirections
     manifest: Mapping[str, Any] = field(default_factory=dict)
     """JSON-ready metadata: storage (key `form`), sizes and bounds of the compared storage forms (key `forms`),
@@ -95,12 +93,13 @@ class SemanticField(TensorRecord):
     ) -> SemanticField:
         """Build a field, and record the sizes and error bounds of the compared storage forms in its manifest.
 
-        These are "evidence", "float16" and, if `storage` allows it and a basis meets the tolerance, "low_rank".
+        The compared forms are "evidence", "float16" and, if `storage` allows it and a basis meets the tolerance,
+        "low_rank".
 
         Args:
             source: Result of `refine` (default: no refinement).
-            tolerance: Largest error of the cosine between any Gaussian and any unit vector, > 0. It does not affect
-                storage "evidence" and "float16".
+            tolerance: Largest error of the cosine between the direction of any Gaussian and any unit vector, > 0. It
+                does not affect storage "evidence" and "float16".
             storage: "auto" chooses the smallest storage whose bound is within the tolerance.
             provenance: JSON-ready metadata for the manifest, such as source config, step, encoder and hyperparameters.
         Raises:
@@ -284,7 +283,7 @@ class SemanticField(TensorRecord):
     def load(
         folder: str | Path, means: Float[Tensor, "n 3"] | None = None, *, checkpoint: str | Path = "the checkpoint"
     ) -> SemanticField:
-        """Read a field that `save` wrote.
+        """Read a field written by `save`.
 
         Args:
             means: Centers of the Gaussians that the field must belong to (default: no check).
@@ -391,13 +390,14 @@ _NULL_BLOCK = 32
 
 
 def with_null_level(field: SemanticField, vectors: Float[Tensor, "m d"]) -> SemanticField:
-    """Return the field with null levels.
+    """Return the field with the null level of every Gaussian.
 
-    Its manifest records the top cosines of the null texts in ascending order. A top cosine is the 99.9 % quantile over
-    the Gaussians that have a direction.
+    The null level is the k-th largest cosine between a Gaussian's own direction and the texts of the null vocabulary.
+    Here, k is 3 % of the number of texts, rounded, and at least 2. The manifest of the result records the top cosines
+    of the texts in ascending order. A top cosine is the 99.9 % quantile over the Gaussians that have a direction.
 
     Args:
-        vectors: Vectors of any norm > 0, one for each of at least two texts of the null vocabulary.
+        vectors: Vectors of at least two texts of the null vocabulary, of any norm > 0.
     """
     count = max(2, round(NULL_SHARE * len(vectors)))
     own, source = field.valid(refined=False), field.source.long()

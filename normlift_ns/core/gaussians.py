@@ -20,10 +20,10 @@ MIN_OPACITY = 1 / 255
 SH_C0 = 0.28209479177387814
 """sqrt(1 / (4 pi)), the spherical harmonic of degree 0."""
 MAX_SCALE = 4.8517e8
-"""Largest scale in world units, e^20 with a margin for rounding. The projected covariance of a larger Gaussian may
-overflow float32."""
+"""Largest scale in world units: e^20 with a margin for rounding. The projected covariance of Gaussians with larger
+scales may overflow float32."""
 MAX_MEAN = 1e18
-"""Largest coordinate of a mean in world units; squared distances must fit into float32."""
+"""Largest absolute coordinate of a mean in world units; squared distances must fit into float32."""
 QUATERNION_RANGE = (1e-18, 1e18)
 """Valid range of the largest absolute component of a quaternion. Outside it, the squared length may not be a normal
 float32 number, and the rotation may become NaN or the identity."""
@@ -34,10 +34,10 @@ float32 number, and the rotation may become NaN or the identity."""
 class GaussianScene(TensorRecord):
     """N Gaussians with activated parameters, the input of the rasterizer.
 
-    Parameters may be NaN, infinite or out of range, because training can produce such values. Gaussians with such
-    parameters keep their rows but are never drawn (see `drawable`), and `Evidence.num_excluded` counts them. They have
-    no evidence, no direction of their own and a reliability of 0. Exports omit Gaussians with parameters that are not
-    finite.
+    Parameters may be NaN, infinite or outside the limits of `drawable`, because training can produce such values.
+    Gaussians with such parameters keep their rows but are never drawn, and `Evidence.num_excluded` counts them. They
+    have no evidence, no direction of their own and a reliability of 0. Exports omit Gaussians with parameters that are
+    not finite.
 
     Raises:
         ValueError: If a shape, type or device is wrong, a scale is negative, or an opacity is outside 0..1.
@@ -60,7 +60,7 @@ class GaussianScene(TensorRecord):
     opacities: Float[Tensor, " n"]
     """Opacities in 0..1, not logits."""
     primitive: Primitive = "3dgs"
-    """Kind of the Gaussians. "2dgs": flat Gaussians, which 2D Gaussian Splatting draws without their third scale."""
+    """Kind of Gaussians. "2dgs": flat Gaussians of 2D Gaussian Splatting, drawn without their third scale."""
 
     def __post_init__(self) -> None:
         for name in ("quats", "scales", "opacities"):
@@ -83,7 +83,7 @@ class GaussianScene(TensorRecord):
         return self.means.shape[0]
 
     def select(self, rows: Int64[Tensor, " m"] | Bool[Tensor, " n"] | slice) -> GaussianScene:
-        """Return some of the Gaussians, without gradients."""
+        """Return a scene of the selected Gaussians, without gradients."""
         tensors = {name: getattr(self, name).detach()[rows] for name in ("means", "quats", "scales", "opacities")}
         return replace(self, **tensors)
 
@@ -168,7 +168,7 @@ class Camera:
 
     @check_arguments
     def downscaled(self, factor: float) -> Camera:
-        """Return the camera of an image whose size is multiplied by `factor` and rounded.
+        """Return the camera of an image whose width and height are multiplied by `factor` and rounded.
 
         Args:
             factor: Positive number. Values above 1 count as 1.

@@ -1,4 +1,4 @@
-"""Quality of a lift, measured without labels by the recognition of regions in views that were left out.
+"""Quality of a lift, measured without labels by the recognition of regions in left-out views.
 
 Half of the views are left out, the others are lifted, and the left-out regions are compared with the lift. Then the
 halves are swapped. Let s be a region of a left-out view, and u_j the directions of the Gaussians from the kept views.
@@ -68,7 +68,7 @@ def leave_views_out(
     Args:
         sampled: Evidence of the Gaussians from `sample_gaussians`.
         probability: Sampling probability of each row.
-        features: F, before the consensus; unit rows or 0.
+        features: F, the features before the consensus, as unit or zero rows.
         level: Level of every region (default: the same for all). Regions of different levels are not compared.
         power, least: Options of the consensus, as in `consensus`. If `least` is None, lift the kept views without a
             consensus.
@@ -113,7 +113,7 @@ def leave_views_out(
 def _lifted_regions(
     sampled: Evidence, probability: Tensor, kept: Int64[Tensor, " k"], columns: Int64[Tensor, " c"], table: Tensor
 ) -> Float[Tensor, "c d"]:
-    """Return sum_j E_js u_j of some regions, with u from the kept views, estimated from the sample."""
+    """Return sum_j E_js u_j for the given columns s, with u from the kept views, estimated from the sample."""
     views = kept.tolist()
     lifted = lift(sampled.select_views(views), table[sampled.columns_of(views)])
     rows = sampled.rows.select_columns(columns, sampled.num_regions)
@@ -129,7 +129,7 @@ def _lifted_regions(
 
 
 def _among(found: Overlaps, keep: Bool[Tensor, " s"]) -> Overlaps:
-    """Return the overlaps among some regions, renumbered."""
+    """Return the overlaps among the regions to keep, which are renumbered from 0."""
     row, column = found.iou.row_index(), found.iou.column.long()
     entry = keep[row] & keep[column]
     new = keep.cumsum(0) - 1
@@ -146,9 +146,9 @@ def _partners(found: Overlaps, kept: Bool[Tensor, " s"], features: Float[Tensor,
 def _nearest_is_own(
     rows: Float[Tensor, "c d"], features: Float[Tensor, "c d"], group: Int64[Tensor, " c"]
 ) -> Bool[Tensor, " c"]:
-    """Return True for each nonzero row that is nearer to its own feature than to the other features of its group.
+    """Return a mask of the nonzero rows that are nearer to their own feature than to the other features of their group.
 
-    The result is False for the only row of a group.
+    The mask is False for the only row of a group.
     """
     found = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     for one in group.unique().tolist():

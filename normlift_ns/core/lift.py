@@ -33,7 +33,7 @@ _MIN_WEIGHT, _MAX_WEIGHT = 1e-15, 1e15
 """Smallest W_j that counts as evidence, and largest valid E_js. Within these limits, squared sums fit into float32.
 Rasterizers return weights in 1e-13..1e9."""
 _LENGTH_TOLERANCE = 1e-2
-"""Accepted deviation of the length of a unit row from 1. Rows in half precision deviate from 1 by rounding."""
+"""Limit on the deviation of the length of a unit row from 1. It allows for rounding to half precision."""
 
 
 @check_arguments
@@ -66,7 +66,7 @@ class Scalars(TensorRecord):
     reliability: Float[Tensor, " n"]
     """Reliability R_j, in 0..1."""
     weight: Float[Tensor, " n"]
-    """W_j, the sum of W_jv over all views, by which the weighted sum of the features is divided."""
+    """W_j, the sum of W_jv over all views. f_j is the weighted sum of the features, divided by W_j."""
     view_count: Int32[Tensor, " n"]
     """Number of views in which the Gaussian has weight."""
 
@@ -83,7 +83,7 @@ class Scalars(TensorRecord):
 @check_arguments
 @dataclass(frozen=True)
 class Lifted:
-    """Result of a lift, with the scalars of every Gaussian, and the evidence and features that determine directions.
+    """Result of a lift: the scalars of every Gaussian, and the evidence and features that determine its direction.
 
     >>> import torch
     >>> from normlift_ns import Evidence, lift
@@ -105,7 +105,7 @@ class Lifted:
     ) -> Float[Tensor, "m d"]:
         """Return u_j of all or some Gaussians as unit rows, or 0 for those without a direction.
 
-        The row of a Gaussian does not depend on which others are requested.
+        The row of a Gaussian does not depend on which other Gaussians are requested.
 
         Args:
             dtype: Type of the result (default: that of the features). Half precision halves the memory of the result.
@@ -143,13 +143,14 @@ class Lifted:
 def lift(
     evidence: Evidence, features: Float[Tensor, "s d"], *, beta: float = 1.0, unlabeled: UnlabeledMode = "ignore"
 ) -> Lifted:
-    """Compute directions u_j and reliability R_j of all Gaussians with equations 3 to 8 of the paper.
+    """Compute the direction u_j and reliability R_j of every Gaussian with equations 3 to 8 of the paper.
 
     The formulas are at the top of this module.
 
     Args:
         evidence: E, from `rasterize_evidence`.
-        features: One unit row per column of the evidence. Deviations of the lengths up to 0.01 are corrected.
+        features: One unit row per column of the evidence. Rows whose lengths differ from 1 by less than 0.01 are
+            normalized.
         beta: Prior strength of the shrinkage of R, as a number of views, >= 0.
         unlabeled: "ignore" omits unlabeled pixels. "dilute" counts them in every W_jv, as observations of the zero
             vector.
@@ -208,7 +209,7 @@ def _unit_table(evidence: Evidence, features: Tensor) -> Tensor:
 
 
 def _sums(evidence: Evidence, table: Tensor) -> tuple[Tensor, ...]:
-    """Return ||sum_v S_jv||, sum_v ||S_jv||, and the results of `_weights`, per Gaussian."""
+    """Return ||sum_v S_jv||, sum_v ||S_jv||, and the results of `_weights` for every Gaussian."""
     if _has_kernel(table):
         from normlift_ns.kernels.sparse import row_norms  # noqa: PLC0415 (needs triton)
 
@@ -220,7 +221,7 @@ def _sums(evidence: Evidence, table: Tensor) -> tuple[Tensor, ...]:
 
 
 def _weights(view_weights: SparseRows) -> tuple[Tensor, Tensor, Tensor]:
-    """Return W_j, sum_v W_jv ** 2 and the number of views with weight."""
+    """Return W_j, sum_v W_jv ** 2 and the number of views with weight for every Gaussian."""
     squared = segment_sum(view_weights.weight.double() ** 2, view_weights.offsets)
     return view_weights.row_sums(), squared, segment_sum((view_weights.weight > 0).float(), view_weights.offsets)
 
@@ -260,12 +261,12 @@ def _ratio(numerator: Tensor, denominator: Tensor, where: Tensor) -> Tensor:
 def check_unit_rows(
     rows: Float[Tensor, "m d"], name: str, advice: str, *, allow_zeros: bool = False
 ) -> Float64[Tensor, " m"]:
-    """Return the lengths of rows, and raise ValueError unless all are unit vectors.
+    """Return the lengths of all rows, and raise ValueError unless the rows are unit vectors.
 
     Args:
         name: Name of the rows in the message, for example "feature rows".
         advice: Suggestion for the user in the message.
-        allow_zeros: Accept rows of zeros too.
+        allow_zeros: Also accept rows of zeros.
     Raises:
         ValueError: If a row has the wrong length or is not finite. The message gives the number of these rows and up to
             three examples.

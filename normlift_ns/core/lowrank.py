@@ -56,7 +56,7 @@ def spectral_table(features: Float[Tensor, "s d"], team: Communicator | None = N
 
 
 def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
-    """Return the first `rank` eigenvectors with their bound.
+    """Return the basis of the first `rank` eigenvectors, with the error bound of every Gaussian.
 
     Let r_s be the residual of row s, and x_j = sum_s E_js r_s / (W_j ||f_j||). Then the component of u_j outside the
     basis has a length of at most x_j. Projecting and renormalizing moves u_j by at most sqrt(2 - 2 sqrt(1 - x_j^2)) if
@@ -71,11 +71,9 @@ def basis_of_rank(lifted: Lifted, table: SpectralTable, rank: int) -> Basis:
 
 
 def smallest_basis(lifted: Lifted, tolerance: float, team: Communicator | None = None) -> Basis | None:
-    """Return the basis of lowest rank that keeps the bound of every Gaussian within `tolerance`.
+    """Return the basis of lowest rank that keeps all error bounds within `tolerance`, or None if no rank does.
 
-    Return None if no rank does.
-
-    The bound includes the rounding of coordinates to float16. All processes get the same basis.
+    The bounds here include the rounding of coordinates to float16. All processes get the same basis.
     """
     table = spectral_table(lifted.features, team)
     low, high, best = 1, lifted.features.shape[1] + 1, None
@@ -97,8 +95,8 @@ def smallest_basis(lifted: Lifted, tolerance: float, team: Communicator | None =
 _QUANTILES = (0.0, 0.5, 0.9, 0.99, 1.0)
 _BLOCK_ROWS = 1024
 _CPU_BLOCK, _GPU_BLOCK = 2**19, 2**25
-"""Number of elements that a query converts to float32 at a time, on CPU and GPU. Blocks that fit into the CPU cache are
-four times as fast."""
+"""Number of elements that a query converts to float32 at a time, on CPU and GPU. On the CPU, a query is four times as
+fast if the blocks fit into the cache."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,10 @@ class StoredEvidence(TensorRecord):
     features: Float[Tensor, "s d"]
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
-        """Return cosines to unit vectors t as E (F t) / (W_j ||f_j||), computed in float64; 0 without a direction."""
+        """Return the cosines to unit vectors t as E (F t) / (W_j ||f_j||), computed in float64.
+
+        They are 0 for Gaussians without a direction.
+        """
         transposed = vectors.double().T  # block by block, because each block of float64 fits into the CPU cache
         table = torch.cat([block.double() @ transposed for block in self.features.split(_BLOCK_ROWS)])
         length = scalars.weight.double() * scalars.norm.double()
@@ -137,7 +138,7 @@ class StoredDirections(TensorRecord):
         return (self.coordinates if self.basis is None else self.basis).shape[1]
 
     def products(self, vectors: Float[Tensor, "q d"], scalars: Scalars) -> Float[Tensor, "n q"]:
-        """Return cosines to unit vectors, or 0 for Gaussians without a direction."""
+        """Return the cosines to unit vectors, or 0 for Gaussians without a direction."""
         projected = vectors.float() if self.basis is None else vectors.float() @ self.basis.T
         out = vectors.new_zeros(scalars.norm.numel(), len(vectors), dtype=torch.float32)
         step = max(1, (_GPU_BLOCK if self.coordinates.is_cuda else _CPU_BLOCK) // projected.shape[1])
@@ -153,10 +154,10 @@ class StoredDirections(TensorRecord):
 
 
 def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, " n"]) -> StoredDirections:
-    """Return the directions of all Gaussians that have one.
+    """Convert the directions of a lift to their storage form.
 
     Args:
-        basis: Vectors of the basis as rows, to store coordinates in it, or None to store full directions.
+        basis: Basis vectors as rows, to store coordinates, or None to store full directions.
         order: Indices of all Gaussians from `spatial_order`.
     """
     coordinates, gaussians = encode_directions(lifted, basis, order.split(PARTITION_BLOCK))
@@ -166,13 +167,13 @@ def store_directions(lifted: Lifted, basis: Tensor | None, order: Int64[Tensor, 
 def encode_directions(
     lifted: Lifted, basis: Tensor | None, blocks: Iterable[Int64[Tensor, " _"]]
 ) -> tuple[Float16[Tensor, "m r"], Int64[Tensor, " m"]]:
-    """Return the float16 coordinates of every Gaussian with a direction, and its row in the lift, block by block.
+    """Return the float16 coordinates of every Gaussian with a direction, and its row in the lift, in block order.
 
     Rounding may depend on which rows are multiplied together. The blocks are therefore the same for any number of
     processes.
 
     Args:
-        blocks: Rows of the lift that are encoded together.
+        blocks: Row indices in the lift. The rows of each block are encoded together.
     """
     dimension = lifted.features.shape[1] if basis is None else len(basis)
     mask, coordinates = lifted.scalars.norm > 0, [lifted.features.new_zeros(0, dimension, dtype=torch.float16)]
@@ -188,7 +189,13 @@ def encode_directions(
 def arrange_directions(
     parts: Sequence[Float16[Tensor, "_ r"]], gaussians: Sequence[Int64[Tensor, " _"]], basis: Tensor | None, n: int
 ) -> StoredDirections:
-    """Join parts of the directions of n Gaussians in index order; `gaussians` lists the indices of each part's rows."""
+    """Arrange the stored directions of n Gaussians by Gaussian index.
+
+    Args:
+        parts: Parts of the directions or coordinates.
+        gaussians: Index of the Gaussian of every row, for each part.
+        basis: As in `store_directions`.
+    """
     row_of = torch.zeros(n + 1, dtype=torch.int64, device=parts[0].device)
     for index in gaussians:
         row_of[index + 1] = 1
@@ -202,7 +209,7 @@ def arrange_directions(
 def sizes_and_bounds(
     lifted: Lifted, basis: Basis | None, portion: Partition | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Return the size in bytes of each storage form, without scalars and source, and its bound on the cosine error.
+    """Return the size in bytes (without scalars and source) and the bound on the cosine error of each storage form.
 
     Args:
         basis: Basis of the form "low_rank", or None to leave this form out.

@@ -38,7 +38,7 @@ class ClassScores(NamedTuple):
 def confusion(truth: Int[Tensor, "*m"], predicted: Int[Tensor, "*m"], classes: int) -> Int64[Tensor, "c c_plus_1"]:
     """Return the confusion matrix, with one row per true class and one column per predicted class.
 
-    The last column counts points without a predicted class. Points with a negative true class are ignored.
+    An additional last column counts points without a predicted class. Points with a negative true class are ignored.
 
     Args:
         truth: True classes.
@@ -73,13 +73,13 @@ def class_scores(counts: Int64[Tensor, "c c_plus_1"]) -> ClassScores:
 def classify(
     scores: Float[Tensor, "n c"], valid: Bool[Tensor, " n"], *, without_direction: WithoutDirection = "none"
 ) -> Int64[Tensor, " n"]:
-    """Return the class with the largest score; ties go to the first class.
+    """Return the class with the largest score for every Gaussian; ties go to the first class.
 
     Args:
         valid: Mask of the Gaussians with a direction, from `SemanticField.valid`.
-        without_direction: Class of the other Gaussians. "none" is `NO_CLASS`, which only lowers scores of the true
-            class. "first" is class 0, the arg-max of a zero feature in published scripts. It adds false positives to
-            this class, which is wall in ScanNet.
+        without_direction: Class of the other Gaussians. "none" is `NO_CLASS`, which lowers only the scores of the true
+            class. "first" is class 0, the argmax for a zero feature in published scripts. It adds false positives to
+            class 0, which is wall in ScanNet.
     """
     best = scores.argmax(dim=1)
     return torch.where(valid, best, NO_CLASS if without_direction == "none" else 0)
@@ -128,7 +128,7 @@ def spearman_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation
 
 
 def kendall_test(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> Correlation:
-    """Compute Kendall's tau-b in O(n log n) steps."""
+    """Compute Kendall's tau-b in O(n log n) time."""
     return _correlation("kendalltau", a, b)
 
 
@@ -147,7 +147,7 @@ def bin_means(
 ) -> tuple[Float64[Tensor, " bins"], Float64[Tensor, " bins"]]:
     """Return the means of keys and values in bins of ascending keys. Ties are ordered by index.
 
-    The numbers of points in two bins differ by at most 1.
+    The sizes of the bins differ by at most one point.
 
     Raises:
         ValueError: If there are fewer points than bins.

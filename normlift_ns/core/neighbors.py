@@ -26,7 +26,7 @@ _MAX_RANKED = 2**22
 """Largest number of candidates that are ranked at a time."""
 
 Progress = Callable[[int, int], None]
-"""Callback after every block of Gaussians, with the number of Gaussians that are done and the total number."""
+"""Function called after every block of Gaussians with the number processed so far and the total number."""
 
 
 @check_arguments
@@ -59,17 +59,17 @@ def nearest_neighbors(
     progress: Progress | None = None,
     team: Communicator | None = None,
 ) -> Neighbors:
-    """Find the exact K nearest neighbors in 3D, N_K(i) of the paper, excluding self.
+    """Find the exact K nearest neighbors in 3D, N_K(i) of the paper, excluding the Gaussian itself.
 
     The CPU uses a k-d tree of the distinct positions, because any number of Gaussians may share a position. The GPU
     uses `kernels.nearest` for float32 means and K up to 60. A row of its result is uncertain if a Gaussian that the
     search dropped could be as near as the last neighbor. For up to 1,000 uncertain rows, the GPU computes all
-    distances. If there are more, the CPU repeats the search. A Gaussian whose mean is not finite has no neighbors and
-    is not a neighbor of others.
+    distances of these rows. If there are more, the CPU repeats the search. A Gaussian whose mean is not finite has no
+    neighbors and is not a neighbor of others.
 
     Args:
-        of: Distinct indices of Gaussians to find neighbors for, one per row of the result (default: all n).
-        progress: Callback after every block of Gaussians, with the number that are done and the total number.
+        of: Distinct indices of the Gaussians to find neighbors for, one per row of the result (default: all n).
+        progress: Function called after every block of Gaussians with the number processed so far and the total number.
         team: Processes that call this function together, each for a part of the same Gaussians (default: only this
             process).
     Raises:
@@ -99,7 +99,7 @@ def _on_gpu(
     progress: Progress | None,
     team: Communicator | None,
 ) -> Neighbors | None:
-    """Find neighbors on the GPU; return None if the kernel does not apply or cannot certify its result."""
+    """Find neighbors on the GPU, or return None if the kernel cannot be used or leaves too many rows uncertain."""
     from normlift_ns.kernels import nearest  # noqa: PLC0415 (needs triton)
 
     finite = means.isfinite().all(dim=1)
@@ -128,7 +128,11 @@ def _on_gpu_finite(
     progress: Progress | None,
     team: Communicator | None,
 ) -> Neighbors | None:
-    """Find neighbors among finite points, and report progress as a share of `rows`."""
+    """Find neighbors among finite points, or return None if too many rows are uncertain.
+
+    Args:
+        rows: Total number to report as progress.
+    """
     from normlift_ns.kernels import nearest  # noqa: PLC0415 (needs triton)
 
     def report(done: int) -> None:
@@ -186,7 +190,7 @@ def _on_cpu(
 
 
 def _members(position_of: np.ndarray, limit: int) -> np.ndarray:
-    """Return the first `limit` Gaussians by index at every position, [positions + 1, slots], padded with -1."""
+    """Return up to `limit` Gaussians at every position, in index order, as [positions + 1, slots] padded with -1."""
     by_position = np.argsort(position_of, kind="stable")
     count = np.bincount(position_of)
     first = np.cumsum(count) - count
@@ -198,7 +202,7 @@ def _members(position_of: np.ndarray, limit: int) -> np.ndarray:
 def _rank_gaussians(
     tree: Any, member: np.ndarray, queries: np.ndarray, near: np.ndarray, reach: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the `count` Gaussians nearest to each query position and their distances, by (distance, index).
+    """Return the `count` Gaussians nearest to each query position and their distances, sorted by (distance, index).
 
     Args:
         member: Gaussians at every position, from `_members`.

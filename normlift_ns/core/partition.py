@@ -41,7 +41,7 @@ class Communicator(ABC):
 
     @abstractmethod
     def all_reduce(self, values: Tensor) -> Tensor:
-        """Return the sum over all processes, in every process."""
+        """Return the elementwise sum over all processes, in every process."""
 
     @abstractmethod
     def broadcast(self, values: Tensor) -> Tensor:
@@ -60,8 +60,8 @@ class Communicator(ABC):
 class Partition:
     """Partition of the Gaussians among processes, by segments of a space-filling curve.
 
-    Most neighbors in space are in the same process. The arrays of a process have one row for each of its Gaussians, in
-    index order.
+    Neighbors in space are mostly in the same process. The arrays of a process have one row for each of its Gaussians,
+    in index order.
     """
 
     communicator: Communicator
@@ -91,7 +91,7 @@ class Partition:
 
     @cached_property
     def place(self) -> tuple[Int32[Tensor, " n"], Int32[Tensor, " n"]]:
-        """Rank of the process that owns each Gaussian, and row of the Gaussian in that process."""
+        """Rank of the process that owns each Gaussian, and row of the Gaussian in the arrays of that process."""
         owner, row = (torch.empty_like(self.order, dtype=torch.int32) for _ in range(2))
         for rank, gaussians in enumerate(self.indices_by_rank):
             owner[gaussians] = rank
@@ -109,7 +109,7 @@ class Partition:
         return iter(self.curve_rows.split(PARTITION_BLOCK))
 
     def all_gather(self, rows: Tensor) -> Tensor:
-        """Return the joined arrays of all processes in index order, in every process."""
+        """Return the rows of all Gaussians in index order, in every process."""
         joined = self.communicator.all_gather(rows)
         return torch.empty_like(joined).index_copy_(0, torch.cat(self.indices_by_rank), joined)
 
@@ -117,8 +117,8 @@ class Partition:
 def spatial_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
     """Return the indices of all Gaussians along a Morton curve, which keeps neighbors in space close to each other.
 
-    The curve has 1,024 steps per axis, from the 1st to the 99th percentile of the means; means outside this range are
-    clamped to it. With the full range, distant outliers would put all other Gaussians into one cell.
+    The curve has 1,024 cells per axis, from the 1st to the 99th percentile of the means; means outside this range are
+    clamped to it. If the curve covered all means, distant outliers could put all other Gaussians into one cell.
 
     >>> spatial_order(torch.tensor([[3.0, 0, 0], [0.0, 0, 0], [2.0, 0, 0]])).tolist()
     [1, 2, 0]

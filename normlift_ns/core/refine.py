@@ -23,9 +23,11 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import RefineConfig, option_name
 
 _CHUNK_ELEMENTS = (2**22, 2**24)
-"""Number of elements of the largest tensor of a vote in torch, on CPU and GPU. The CPU limit suits its caches."""
+"""Maximum number of elements of a tensor in a vote in torch, on CPU and GPU. On the CPU, such a tensor fits into the
+caches."""
 _BLOCK = (2 * PARTITION_BLOCK, 16 * PARTITION_BLOCK)
-"""Number of Gaussians per block, on CPU and GPU. Directions of one block and its neighbors are in memory at a time."""
+"""Number of Gaussians per block, on CPU and GPU. Only the directions of one block and its neighbors are in memory at a
+time."""
 MAX_VOTERS = 256
 """Largest K that `clamp_k` allows. The time of a vote grows with the square of K, because it compares all pairs of
 neighbors."""
@@ -45,7 +47,7 @@ def refine(
     neighbors: Neighbors | None = None,
     progress: Progress | None = None,
 ) -> Int32[Tensor, " n"]:
-    """Select the refined direction of every Gaussian i by a vote of its neighbors, as directions[source[i]].
+    """Select source[i] for every Gaussian i by a vote of its neighbors; the refined direction is directions[source[i]].
 
     Let N be the K nearest neighbors of i, and N+ these neighbors and i itself::
 
@@ -65,16 +67,16 @@ def refine(
 
     Args:
         config: Options of the vote (default: the posterior vote if `own` is given, else the paper's vote).
-        directions: u, unit rows or 0 of any floating-point type. Float64 rows are used in float64, others in float32.
-            If `directions` is a function of indices, such as `Lifted.directions`, only one block is in memory at a
-            time.
+        directions: u, as unit or zero rows of any floating-point type. Float64 rows are used in float64, others in
+            float32. If `directions` is a function of indices, such as `Lifted.directions`, only one block is in memory
+            at a time.
         reliability: R in 0..1.
         own: `Lifted.scalars.own_evidence`, required by the posterior vote and ignored by the paper's vote.
         labeled: `labeled_share` of the evidence. Gaussians below `config.min_labeled` keep their direction (default:
             all may change).
         neighbors: Result of `nearest_neighbors(means, config.k)`, to share one search among several votes (default:
             search for the K of `clamp_k(config, n)`).
-        progress: Callback after every block of Gaussians, with the number that are done and the total number.
+        progress: Function called after every block of Gaussians with the number processed so far and the total number.
     Raises:
         ValueError: If shapes disagree, a direction is neither a unit vector nor 0, `reliability` or `own` is invalid,
             `neighbors` has an invalid index, or `own` is missing.
@@ -111,7 +113,7 @@ def refine(
 
 
 def labeled_share(evidence: Evidence) -> Float64[Tensor, " n"]:
-    """Return the share of every Gaussian's weight, over all views, that lies in regions; 1 without weight."""
+    """Return the share of every Gaussian's weight, over all views, that lies in regions, or 1 without weight."""
     labeled, blank = evidence.rows.row_sums(), evidence.unlabeled.row_sums()
     return torch.where(labeled + blank > 0, labeled / (labeled + blank), 1.0)
 
@@ -132,7 +134,7 @@ def _check_inputs(
 
 @dataclass(frozen=True)
 class _VoteInputs:
-    """Inputs that all blocks of a vote share."""
+    """Inputs shared by all blocks of a vote."""
 
     neighbors: Neighbors
     reliability: Float[Tensor, " n"]
@@ -157,7 +159,8 @@ def refine_subset(
     """Run `refine` for some of the first m Gaussians. The other Gaussians only serve as neighbors.
 
     Args:
-        voters: Gaussians to refine, block by block in this order. Neighbors in space should be close in this order.
+        voters: Indices of the Gaussians to refine, in processing order. Neighbors in space should be close to
+            each other in this order.
         neighbors: Neighbors of the first m Gaussians, which include all voters.
         directions, reliability: As in `refine`, for all n Gaussians.
         own: As in `refine`, used for voters only, or None for the paper's vote.
@@ -202,7 +205,7 @@ def refine_subset(
 def clamp_k(config: RefineConfig, n: int) -> RefineConfig:
     """Limit K to the number of other Gaussians and to `MAX_VOTERS`, and warn if this reduces K.
 
-    Other options that are None, except tau and gamma, are set to the defaults of the kind of vote.
+    Other options that are None, except tau and gamma, are set to the defaults for the kind of vote.
 
     >>> import warnings
     >>> with warnings.catch_warnings(record=True) as caught:
@@ -251,7 +254,10 @@ def _vote(inputs: _VoteInputs, voters: Tensor, directions: Tensor, row_of: Tenso
 
 
 def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64[Tensor, ""]:
-    """Return sigma_d times the median spacing, in the units of the means, or sigma_d without a finite spacing."""
+    """Return sigma_d in the units of the means: the option `sigma_d` times the median spacing.
+
+    If no spacing is finite, return the option itself.
+    """
     finite = spacing[spacing.isfinite()]
     sigma = config.numbers.sigma_d
     if finite.numel() == 0:
@@ -264,7 +270,7 @@ def decay_width(spacing: Float64[Tensor, " n"], config: RefineConfig) -> Float64
 def voting_weights(
     neighbors: Neighbors, width: Float64[Tensor, ""], rows: Int[Tensor, " m"], reliability: Float[Tensor, " n"]
 ) -> Float64[Tensor, "m k_plus_1"]:
-    """Return R_k d_ik of the given Gaussians, i itself first, or 0 for a missing neighbor.
+    """Return R_k d_ik for every given Gaussian i and member k of N+, with i itself first, or 0 for a missing neighbor.
 
     Squared distances are relative to that of the nearest reliable member of N+, which is i itself unless R_i = 0. This
     multiplies all weights of i by one factor, so the winner stays the same, and the weights do not underflow. `_margin`
@@ -284,9 +290,9 @@ def posterior_weights(
 ) -> Float64[Tensor, "m k_plus_1"]:
     """Return own_i, followed by P R_k d_ik / sum_k R_k d_ik of every neighbor k.
 
-    The weight of a missing neighbor is 0, and so are all weights of neighbors if none is reliable. Squared distances
-    are relative to that of the nearest reliable neighbor. This multiplies every d_ik by the same factor, which cancels,
-    and avoids underflow.
+    The weight of a missing neighbor is 0, and so are the weights of all neighbors if none is reliable. Squared
+    distances are relative to that of the nearest reliable neighbor. This multiplies every d_ik by the same factor,
+    which cancels, and avoids underflow.
     """
     r, square = _within(neighbors, width, rows, reliability)
     near = r[:, 1:] * _decay(r[:, 1:], square[:, 1:])
@@ -309,7 +315,7 @@ def _nearest(r: Tensor, square: Tensor) -> Tensor:
 
 
 def _decay(r: Tensor, square: Tensor) -> Tensor:
-    """Return d for squared distances relative to that of the nearest reliable member."""
+    """Return d_ik, computed from squared distances relative to that of the nearest reliable member."""
     return torch.exp(-0.5 * (square - _nearest(r, square)).nan_to_num(0).clamp(min=0))
 
 
@@ -348,7 +354,7 @@ def _any_reliable(neighbors: Neighbors, reliability: Float[Tensor, " n"]) -> Boo
 
 
 def _members(voters: Int[Tensor, " v"], neighbors: Neighbors, n: int) -> Int64[Tensor, " m"]:
-    """Return the distinct voters and neighbors among n Gaussians, ascending."""
+    """Return the distinct indices of voters and their neighbors among n Gaussians, in ascending order."""
     if can_use_triton(neighbors.index):
         from normlift_ns.kernels.vote import voters_and_neighbors  # noqa: PLC0415 (needs triton)
 
@@ -383,16 +389,17 @@ SHARED_VIEWS = 0.5
 MAX_TAU = 0.9985
 """Largest tau. A sharper gate would depend on rounding."""
 _PAIRS = 20_000
-"""Approximate number of pairs to measure. The rank of their quantile has a standard error of 0.2 % of the pairs."""
+"""Approximate number of pairs to measure. For this number, the rank of the 5 % quantile has a standard error of about
+0.15 % of the pairs."""
 _LEAST_PAIRS = 50
 
 
 def sample_pairs(
     gaussians: Int64[Tensor, " m"], neighbors: Int32[Tensor, "m k"], n: int
 ) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " p"]]:
-    """Return rows of sampled Gaussians, and one neighbor of each.
+    """Return the rows of sampled Gaussians, and one neighbor of each.
 
-    The sample and the choice of neighbors depend only on the indices of the Gaussians.
+    The sample and the choice of neighbors depend only on n, k and the indices of the Gaussians.
 
     Args:
         gaussians: Index of every row among all n Gaussians.
@@ -414,7 +421,7 @@ def shared_region_cosines(
 
     Args:
         first, second: Rows of the two Gaussians of every pair.
-        level: Level of every region (default: the same for all). A level of a view counts as a view of its own.
+        level: Level of every region (default: the same for all). Each level of a view counts as a separate view.
     """
     norm = lifted.scalars.norm
     usable = (norm[first] > 0) & (norm[second] > 0)
@@ -431,7 +438,7 @@ def shared_views(
     second: Int64[Tensor, " p"],
     level: Int64[Tensor, " s"] | None = None,
 ) -> tuple[Float64[Tensor, " p"], Float64[Tensor, " p"]]:
-    """Return the number of views in which two Gaussians share a region, and the number of views with regions of both.
+    """Return, for every pair, the numbers of views with a shared region and of views with regions of both Gaussians.
 
     A Gaussian may lie in several regions of a view. The first number then counts the view with the probability that
     both Gaussians lie in the same region.
@@ -455,12 +462,12 @@ def shared_views(
 
 
 def relative_gate(cosines: Float64[Tensor, " q"], quantile: float = GATE_QUANTILE) -> tuple[float, float] | None:
-    """Return tau and gamma for the cosines of `shared_region_cosines`, or None if there are fewer than 50.
+    """Return tau and gamma for the cosines of `shared_region_cosines`, or None if there are fewer than 50 cosines.
 
-    Both are rounded to four decimal places, so that rounding errors of the lift do not change them.
+    Tau and gamma are rounded to four decimal places, so that rounding errors of the lift do not change them.
 
     Args:
-        quantile: Share of the cosines that are below tau, in 0..1, unless tau would exceed `MAX_TAU`.
+        quantile: Fraction of the cosines below tau, in 0..1, unless tau would exceed `MAX_TAU`.
 
     >>> relative_gate(torch.linspace(0.8, 1.0, 101, dtype=torch.float64))
     (0.81, 0.095)
@@ -473,7 +480,7 @@ def relative_gate(cosines: Float64[Tensor, " q"], quantile: float = GATE_QUANTIL
 
 
 def _shares(rows: SparseRows, group: Int64[Tensor, " s"]) -> tuple[Int64[Tensor, " g"], Float64[Tensor, " nnz"]]:
-    """Return a key of every (row, group) with weight, and the share of every entry in the weight of its group."""
+    """Return the sorted keys of (row, group) pairs with entries, and the share of every entry in its pair's weight."""
     key = rows.row_index() * (int(group.max()) + 1) + group[rows.column.long()]
     seen, total = sum_equal_keys(key, rows.weight.double())
     return seen, rows.weight.double() / total.clamp(min=1e-30)[torch.searchsorted(seen, key)]
@@ -484,7 +491,8 @@ def _matched(
 ) -> Float64[Tensor, " p"]:
     """Return, for every pair, the sum of at * bt over the keys that `a` and `b` have in common.
 
-    Keys ascend, and pair i has the keys from i * width to (i + 1) * width - 1.
+    `at` and `bt` are the values of the keys in `a` and `b`. Keys are in ascending order, and pair i has the keys from
+    i * width to (i + 1) * width - 1.
     """
     if len(b) == 0:
         return torch.zeros(pairs, dtype=torch.float64, device=a.device)

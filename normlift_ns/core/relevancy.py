@@ -25,11 +25,11 @@ PROMPT_BLOCK = 32
 _SAMPLED = 16
 """Sampling step of `_largest`, which takes every 16th value as a sample."""
 TOP_QUANTILE = 0.999
-"""Quantile over Gaussians that defines the top relevancy of a prompt. Single outliers do not affect it."""
+"""Quantile over Gaussians that defines the top relevancy of a prompt. It is robust to outliers."""
 _LARGEST_COSINE = 1.01
-"""Largest accepted cosine. In half precision, rounding errors of cosines are about a thousandth."""
+"""Largest accepted absolute value of a cosine. In half precision, rounding errors of cosines are about 0.001."""
 _PRESENT = 0.62
-"""Relevancy by the rule "lerf" that objects in a scene usually reach."""
+"""Relevancy by the rule "lerf" that prompts for objects in the scene usually reach."""
 
 
 class RuleSettings(NamedTuple):
@@ -38,7 +38,8 @@ class RuleSettings(NamedTuple):
     formula: Callable[[Any, Any, float], Any]
     """Function that returns the relevancy [..., Q].
 
-    The arguments are the cosines to prompts [..., Q], the cosines to negatives [..., B], and the temperature.
+    The arguments are the cosines to prompts [..., Q], the cosines to negatives [..., B] or the null level
+    [..., 1], and the temperature.
     """
     threshold: float
     """Relevancy above which a Gaussian is selected."""
@@ -61,7 +62,7 @@ def _margin(positive: Any, negative: Any) -> Any:
 
 
 def _namespace(array: Any) -> Any:
-    """Return the module of an array, numpy or torch. Both have the functions that are called here."""
+    """Return the module for an array, numpy or torch. Both modules have the functions that are called here."""
     if isinstance(array, np.ndarray):
         return np
     import torch  # noqa: PLC0415 (a command-line query does not need it)
@@ -166,7 +167,7 @@ def _relevancy(positive: Any, negative: Any, rule: RelevancyRule, temperature: f
 def gaussian_relevancy(
     positive: Float[ArrayT, "n q"], negative: Float[ArrayT, "n b"], valid: Bool[ArrayT, " n"], rule: RelevancyRule
 ) -> Float[ArrayT, "n q"]:
-    """Compute the relevancy of Gaussians. Those without a direction (not `valid`) get `no_direction` of the rule.
+    """Compute the relevancy of Gaussians. Those without a direction (not `valid`) get the rule's `no_direction`.
 
     Raises:
         ValueError: If the rule needs negatives or null levels, and none are given.
@@ -197,7 +198,7 @@ def top_values(values: Float[ArrayT, "n q"]) -> list[float]:
 def _largest(values: Float[np.ndarray, " m"], count: int) -> Float[np.ndarray, " count"]:
     """Return the `count` largest values in ascending order.
 
-    A sample gives a lower bound for them, so that only few values are sorted.
+    A sample gives a probable lower bound for them, so that usually only a few values are sorted.
     """
     sample = np.sort(values[::_SAMPLED])
     bound = sample[-min(len(sample), 2 * count // _SAMPLED + 8)]

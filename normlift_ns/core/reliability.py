@@ -27,8 +27,8 @@ from torch import Tensor
 from normlift_ns.core.sparse import SparseRows
 
 DRIFT = 21.7
-"""Angle in degrees at which the correlation between features of the same object part falls to 1/e, measured on real
-images."""
+"""Angle between two views, in degrees, at which the correlation between their features of the same object part falls to
+1/e, measured on real images."""
 LEAST_RELIABILITY = 0.02
 """r, the R of a Gaussian in a single view if beta > 0. It is positive, because R = 0 means no evidence."""
 _CHUNK_ELEMENTS = 2**22
@@ -51,26 +51,26 @@ def reliability(norm: Float[Tensor, "*n"] | float, n_eff: Float[Tensor, "*n"], b
 def norm_of_reliability(
     reliability: Float[Tensor, " n"], n_eff: Float[Tensor, " n"], beta: float
 ) -> Float64[Tensor, " n"]:
-    """Return ||f_j|| from R_j, the inverse of `reliability`.
+    """Return ||f_j|| from R_j, as the inverse of `reliability`.
 
     After a consensus, R_j and therefore the result are those of the features before the consensus.
 
     Args:
         reliability: The paper's R_j.
         n_eff: N_eff, or 0 without evidence.
-        beta: Prior strength, as for `reliability`.
+        beta: As in `reliability`.
     """
     views = n_eff.double()
     return torch.where(views > 0, reliability.double() * (views + beta) / views, 0.0).clamp(max=1)
 
 
 def pair_reliability(norm: Float[Tensor, " n"], views: Float[Tensor, " n"], beta: float) -> Float[Tensor, " n"]:
-    """Return R_j from pairs of views, the last formula at the top of this module, or 0 without evidence.
+    """Return R_j from pairs of views by the last formula at the top of this module, or 0 without evidence.
 
     Args:
         norm: ||f_j||.
         views: N_j, from `Scalars.n_eff` or `independent_views`.
-        beta: Prior strength, in views, >= 0.
+        beta: Prior strength as a number of views, >= 0.
 
     >>> pair_reliability(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), beta=1.0)
     tensor([0.0200, 0.5100, 0.0000])

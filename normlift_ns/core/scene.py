@@ -15,8 +15,8 @@ from normlift_ns.core.gaussians import Camera, GaussianScene
 from normlift_ns.options import RasterizeMode
 
 _TOLERANCE = 1e-5
-"""Relative tolerance at which two camera parameters count as equal. The absolute tolerance for values near zero is a
-tenth of it."""
+"""Relative tolerance within which two numbers of a camera summary count as equal. A tenth of it is added as an absolute
+tolerance, for numbers near zero."""
 
 
 @check_arguments
@@ -45,7 +45,7 @@ class View(NamedTuple):
     def downscaled(self, height: int, width: int) -> View:
         """Downscale the image by averaging pixels, and adapt its camera.
 
-        A pixel of the mask is True only if it is True for all averaged pixels.
+        A pixel of the mask is True only if the mask is True at all averaged pixels.
         """
         camera = self.camera
         scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], dtype=camera.K.dtype)
@@ -70,7 +70,7 @@ class Views(Protocol):
 
     @property
     def cameras(self) -> Sequence[Camera]:
-        """Cameras of the images, in the same order. No image is read."""
+        """Cameras of the images, in the order of `names`. No image is read."""
         ...
 
     def __len__(self) -> int: ...
@@ -123,7 +123,7 @@ class Scene(Protocol):
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
-        """Rasterization mode of the training, which a lift should use too."""
+        """Rasterization mode that was used in training, and that a lift should also use."""
         ...
 
     @property
@@ -168,10 +168,10 @@ class Scene(Protocol):
 
 
 def camera_summary(cameras: Sequence[Camera]) -> list[float]:
-    """Return numbers that summarize cameras, for a manifest.
+    """Summarize cameras as a list of numbers for a manifest.
 
-    They are the number of cameras, and weighted means of size, intrinsics and pose. The weights increase
-    from 1 for the first camera to 2 for the last, so that the order of the cameras also matters.
+    The list contains the number of cameras, and weighted means of size, intrinsics and pose. The weights increase from
+    1 for the first camera to 2 for the last, so that the order of the cameras also matters.
 
     >>> import torch
     >>> left = Camera(torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]]), torch.eye(4), 16, 12)

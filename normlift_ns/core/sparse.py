@@ -31,7 +31,7 @@ _MAX_SORTED = 2**27
 def segment_sum(values: Tensor, offsets: Int64[Tensor, " rows_plus_1"]) -> Float64[Tensor, " rows"]:
     """Return the sums of the segments values[offsets[i]:offsets[i + 1]] in float64, or 0 for empty segments.
 
-    Each segment is summed separately, so a value of 1e-12 in one row is not lost next to a value of 1e6 in another.
+    Each segment is summed separately, so 1e-12 in one segment is not lost next to 1e6 in another.
 
     >>> segment_sum(torch.tensor([1.0, 2.0, 4.0]), torch.tensor([0, 2, 2, 3])).tolist()
     [3.0, 0.0, 4.0]
@@ -66,12 +66,12 @@ class SparseRows(TensorRecord):
 
     @staticmethod
     def stack(parts: Sequence[tuple[Tensor, Tensor, Tensor]], num_rows: int, device: torch.device) -> SparseRows:
-        """Join lists of (row, column, weight), each sorted by row and then by column.
+        """Build a matrix from lists of (row, column, weight), each sorted by row and then by column.
 
         In every row, the columns of a list must be larger than those of earlier lists.
 
         On the CPU, nothing is sorted. Each row receives its entries of the first list, then those of the second, and so
-        on. On a GPU, a single stable sort of all entries is faster. It is used if it fits into memory.
+        on. On a GPU, a single stable sort of all entries is faster. It is used for up to 2**27 entries.
         """
         dtype = parts[0][2].dtype if parts else torch.float32
         parts = [part for part in parts if part[0].numel() > 0]
@@ -196,7 +196,7 @@ class SparseRows(TensorRecord):
             yield first, SparseRows(offsets - low, self.column[low:high], self.weight[low:high])
 
     def sums_of_unit_rows(self, table: Float[Tensor, "columns d"]) -> Float[Tensor, "rows d"]:
-        """Return the product with a table of unit rows, with accurate directions of all sums.
+        """Return the product with a table of unit rows, with an accurate direction of every row of the result.
 
         Sums that nearly cancel and sums of more than `MANY_ENTRIES` rows are recomputed in float64.
         """
@@ -216,7 +216,7 @@ class SparseRows(TensorRecord):
 def sum_duplicates(
     row: Int[Tensor, " m"], column: Int[Tensor, " m"], weight: Float[Tensor, " m"]
 ) -> tuple[Int[Tensor, " nnz"], Int[Tensor, " nnz"], Float[Tensor, " nnz"]]:
-    """Sort entries by (row, column) and sum duplicates in float64. The result is the same in every run.
+    """Sort entries by (row, column) and sum duplicates in float64. The result is deterministic.
 
     >>> sum_duplicates(torch.tensor([1, 0, 1]), torch.tensor([5, 7, 5]), torch.tensor([1.0, 2.0, 4.0]))
     (tensor([0, 1]), tensor([7, 5]), tensor([2., 5.]))

@@ -1,6 +1,6 @@
 """Colors and legends of query results, the same in every viewer and figure.
 
-The default colormap of relevancy is perceptually uniform and readable with color blindness. Opacity rises with
+The default colormap of relevancy is perceptually uniform and readable with color blindness. Opacity increases with
 relevancy, so that weak matches are less visible. A prompt that names a saturated color is drawn in this color, unless
 an earlier prompt has it. Other prompts get colors that are distinguishable with any color vision (Okabe and Ito, 2008),
 or further hues if these colors are used up.
@@ -31,7 +31,7 @@ blindness.
 RELIABILITY_COLORMAP: Colormap = "cividis"
 """Colormap of the reliability R, always over the range 0 to 1."""
 MIN_OVERLAY_OPACITY, MAX_OVERLAY_OPACITY = 0.35, 0.9
-"""Opacity over the scene at the lowest and the highest selected relevancy."""
+"""Opacity of the overlay at the first and the last color of its scale."""
 _OKABE_ITO = ("e69f00", "56b4e9", "009e73", "f0e442", "0072b2", "d55e00", "cc79a7")
 _MIN_SATURATION = 0.3
 """Minimum saturation of a named color for use as the prompt's color, because unselected Gaussians are gray."""
@@ -88,7 +88,10 @@ def named_color(text: str) -> tuple[float, float, float] | None:
 
 
 def prompt_colors(texts: Sequence[str]) -> Float[Tensor, "q 3"]:
-    """Return a color for each prompt, RGB in 0..1: the color that it names, or else a distinguishable color.
+    """Return a color for each prompt, RGB in 0..1.
+
+    A prompt gets the color that it names. If it names no saturated color, or an earlier prompt has the same color, it
+    gets a distinguishable one.
 
     >>> (prompt_colors(["fox", "sky blue", "sky blue bowl"]) * 255).round().int().tolist()
     [[230, 159, 0], [117, 187, 253], [0, 158, 115]]
@@ -123,7 +126,7 @@ def _candidates() -> tuple[tuple[float, ...], ...]:
 
 
 RGB = tuple[float, float, float]
-"""RGB in 0..1."""
+"""RGB color with components in 0..1."""
 
 
 def prompt_rgb_tuples(texts: Sequence[str]) -> list[RGB]:
@@ -139,7 +142,8 @@ def prompt_rgb_tuples(texts: Sequence[str]) -> list[RGB]:
 
 
 MIN_LEGEND_HEIGHT = 160
-"""Minimum height in pixels of an image with a legend. Smaller images, as rendered while the camera moves, have none."""
+"""Minimum height in pixels of an image with a legend. Smaller images, such as those rendered while the camera
+moves, have none."""
 _MAX_PROMPTS = 12
 _BACKDROP, _INK = (20, 20, 20), (255, 255, 255)
 _BACKDROP_OPACITY = 0.75
@@ -178,7 +182,7 @@ def add_color_bar(
 
 
 def add_prompt_legend(image: Float[Tensor, "h w 3"], texts: Sequence[str], colors: Float[Tensor, "q 3"]) -> Tensor:
-    """Add prompts and their colors to the lower right corner of an image [H, W, 3], if there is enough space."""
+    """Add a legend of prompts to the lower right corner of an image [H, W, 3], if there is enough space."""
     height, width = image.shape[:2]
     if height < MIN_LEGEND_HEIGHT or len(texts) == 0:
         return image
@@ -189,12 +193,12 @@ def add_prompt_legend(image: Float[Tensor, "h w 3"], texts: Sequence[str], color
 
 
 def _font_size(height: int) -> int:
-    """Return the font size in pixels for an image height."""
+    """Return the font size in pixels for an image of the given height."""
     return max(11, height // 42)
 
 
 def _paste(image: Tensor, tile: UInt8[np.ndarray, "rows columns 3"], width: int) -> Tensor:
-    """Paste a tile into the lower right corner of an image, if a third of the image width stays free."""
+    """Paste a tile into the lower right corner of an image, if it fits and leaves a third of the width free."""
     rows, columns = tile.shape[:2]
     margin = max(4, rows // 8)
     if 3 * columns > 2 * width or columns + 2 * margin > width or rows + 2 * margin > len(image):

@@ -44,8 +44,8 @@ SEGMENTATION_OPACITY = 0.8
 class Display:
     """Scalars to render in addition to the colors, and their color scales.
 
-    The class is immutable because the viewer renders in other threads. Q is the number of prompts; it is
-    0 without an answer.
+    The class is immutable because the viewer renders in other threads. Q is the number of prompts, or 0 without an
+    answer.
     """
 
     values: Float[Tensor, "n q_plus_5"]
@@ -90,7 +90,7 @@ def make_display(
     drawn: Bool[Tensor, " n"] | None = None,
     by_hand: bool = False,
 ) -> Display:
-    """Make the display of an answer on the device of the field.
+    """Make the display of an answer, if there is one, on the device of the field.
 
     Args:
         shown: Index of the only prompt to show (default: all prompts).
@@ -117,7 +117,7 @@ def make_display(
 
 
 def color_scale(relevancy: Float[Tensor, " m"], threshold: float) -> tuple[float, float]:
-    """Return a scale from the threshold to the largest relevancy in the scene, at least 0.05 wide."""
+    """Return a scale from the threshold to the largest of the given relevancies, at least 0.05 wide."""
     peak = float(relevancy.max()) if len(relevancy) > 0 else threshold
     return threshold, max(peak, threshold + _MIN_SPAN)
 
@@ -157,8 +157,8 @@ def render_outputs(
 ) -> dict[str, Tensor]:
     """Return the semantic outputs of one image by name, each [H, W, 1] or [H, W, 3], the overlay last.
 
-    The outputs overlay, segmentation and reliability are color images on a gray render of the scene. The other outputs
-    are scalars sum_j A_ij value_j, 0 for empty pixels, except for relevancies with `named_by_text`.
+    The outputs overlay, segmentation and reliability, and the relevancies if `named_by_text` is True, are color images
+    on a gray render of the scene. The other outputs are scalars sum_j A_ij value_j, which are 0 for empty pixels.
 
     Args:
         rgb: Rendered scene, RGB in 0..1.
@@ -234,7 +234,7 @@ def segmentation(
 def reliability_map(
     rgb: Float[Tensor, "h w 3"], reliability: Float[Tensor, "h w 1"], alpha: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """Return a map of the reliability R on a fixed scale from 0 to 1, with a legend.
+    """Return a map of the reliability R on a fixed scale from 0 to 1, with a color bar if there is enough space.
 
     Args:
         reliability: Composited reliability, not divided by `alpha`.
@@ -350,12 +350,12 @@ def contact_sheet(
 
 
 def _columns(panels: int) -> int:
-    """Return the number of columns of a contact sheet."""
+    """Return the number of columns of a contact sheet with the given number of panels."""
     return panels if panels <= _MAX_SINGLE_ROW else math.ceil(math.sqrt(panels))
 
 
 def _panel_width(panels: int) -> int:
-    """Return the width of each panel of a contact sheet, in pixels."""
+    """Return the maximum width in pixels of a panel in a contact sheet with the given number of panels."""
     return min(_THUMBNAIL_WIDTH, _MAX_WIDTH // _columns(panels))
 
 
@@ -375,7 +375,7 @@ def _outlined(overlay: Tensor, selected: Tensor, width: int) -> Image.Image:
 def _page(
     sheet: FigureStyle, titles: Sequence[str], panels: Sequence[Image.Image], captions: Sequence[str], columns: int
 ) -> Image.Image:
-    """Lay out panels in rows of `columns`, with titles above and the color bar below."""
+    """Lay out panels in rows of `columns` panels, with titles above and the color bar below."""
     columns, line, small = min(columns, len(panels)), round(1.5 * _FONT_SIZE), colors.load_font(_FONT_SIZE - 4)
     width, height = (max(panel.size[i] for panel in panels) for i in (0, 1))
     rows = math.ceil(len(panels) / columns)
@@ -431,7 +431,7 @@ CONTACT_SHEET_PREFIX = "contact_sheet"
 _THREADS = min(16, os.cpu_count() or 1)
 """Number of views whose figures are drawn and saved concurrently."""
 _ZLIB_LEVEL = 1
-"""Compression level of PNG files. A level of 4 takes 1.4 times as long for files that are 4% smaller."""
+"""Compression level of PNG files. A level of 4 takes 1.4 times as long for files that are 4 % smaller."""
 
 
 def save_overlays(
@@ -452,7 +452,7 @@ def save_overlays(
     Args:
         cameras: Training cameras by file name prefix, as `training_cameras` returns them.
         settings: Rasterizer settings (default: those of gsplat 1.4).
-        device: torch device that renders.
+        device: torch device to render on.
         overwrite: Replace existing files.
     Returns:
         Paths of the files.
@@ -519,7 +519,7 @@ def _render_overlays(
     settings: RasterSettings | None,
     device: str,
 ) -> Iterator[tuple[str, list[_Overlay]]]:
-    """Yield the name of every view with the overlays of all prompts, which are rendered together."""
+    """Yield the name of every view with its overlays, one per prompt. All overlays of a view are rendered together."""
     count, gaussians = len(answer.texts), scene.gaussians.to(device)
     values = torch.cat([answer.relevancy.float(), answer.selected.float()], dim=1).to(device)
     for name, camera in cameras.items():
@@ -543,8 +543,8 @@ def training_cameras(scene: Scene, names: Sequence[str] = ()) -> dict[str, Camer
     """Return training cameras by unique file name.
 
     Args:
-        names: Names from `unique_file_names`, image paths with or without suffix, or their stems (default: names of
-            three views).
+        names: Names from `unique_file_names`, image paths with or without suffix, or their stems (default: up to three
+            evenly spaced views).
     Raises:
         ValueError: A name matches no training image, or several.
     """
@@ -578,9 +578,8 @@ def save_inventory(
 ) -> str:
     """Write a PNG render of the scene with outlines, numbers and names of the objects of an inventory.
 
-    The camera is that of the training image that shows the most objects. Among images that show the same number, it is
-    the one with the largest mean size of the objects. Here, the size of an object is a fraction of its largest size in
-    any image.
+    The camera is that of the training image that shows the most objects. In a tie, it is the one with the largest mean
+    size of the objects. Here, the size of an object is a fraction of its largest size in any training image.
 
     Args:
         path: File to write.
@@ -610,7 +609,7 @@ def save_inventory(
 
 
 def _numbered(image: UInt8[Tensor, "h w 3"], masks: Bool[Tensor, "m h w"], names: Sequence[str]) -> Image.Image:
-    """Draw the outline of every mask, and its number and name at a position well inside the mask."""
+    """Draw the outline of every mask, and its number and name at the mask pixel with the most mask pixels around it."""
     height, width = image.shape[:2]
     line = max(1, round(max(height, width) * _OUTLINE_FRACTION))
     canvas, size = image.clone().cpu(), max(12, max(height, width) // 40)
@@ -643,7 +642,7 @@ def write_masks(
     settings: RasterSettings | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write one PNG mask per training image, of the same size: 255 for the pixels of `view_mask`, 0 for others.
+    """Write one PNG mask per training image, of the same size, with 255 for the pixels of `view_mask` and 0 for others.
 
     If an error occurs, no file is written. Objects in front of the selection occlude it. The masks match the
     undistorted images that the training used.
