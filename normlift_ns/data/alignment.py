@@ -25,8 +25,8 @@ from normlift_ns.rasterization.settings import RasterSettings
 MIN_PSNR = 24.0
 """Lower bound of the usual PSNR in dB. Real scenes reach 25 to 40 dB on their training images."""
 MIN_MARGIN = 3.0
-"""Minimum `Alignment.margin` in dB. In `python -m research.worlds`, the margin is smaller for cameras in a wrong world,
-and at least 4 dB for cameras in the right world."""
+"""Minimum `Alignment.margin` in dB. In `python -m research.worlds`, the margin is smaller for cameras in the wrong
+world, and at least 4 dB for cameras in the right world."""
 _MIN_VISIBLE = 0.001
 """Minimum `Alignment.visible_fraction`."""
 _CACHE_VERSION = "normlift_ns.alignment/1"
@@ -41,7 +41,7 @@ class Alignment(NamedTuple):
     worst: tuple[str, float]
     """Name of the image whose render has the lowest PSNR, and this PSNR in dB."""
     visible_fraction: float
-    """Largest fraction over the views, in 0..1, of Gaussians whose centers are inside the image."""
+    """Largest fraction over the views, in 0..1, of Gaussians whose centers project into the image."""
     mean_color_psnr: float
     """Mean PSNR in dB if each image is compared with its mean color instead of a render."""
     margin: float
@@ -193,6 +193,6 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
 
 
 def in_frustum(means: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:
-    """Return a mask of the Gaussians whose centers are inside the image and in front of the camera."""
+    """Return a mask of the Gaussians whose centers are in front of the camera and project into the image."""
     _, _, depth, inside = camera.project(means)
     return inside & (depth > 0)

@@ -83,9 +83,9 @@ def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor],
 def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments: tuple[str, ...] = ()) -> CompressedPly:
     """Sort Gaussians into chunks that cover small boxes, and encode them as a compressed PLY file.
 
-    Opacities and color channels have 8 bits, and three components of each rotation have 10 bits. Coordinates and
-    logarithms of scales have 10 or 11 bits for their range in a chunk. Spherical harmonics have steps of 1/32 between
-    -4 and 4.
+    Opacities and color channels have 8 bits, and the three smaller components of a quaternion have 10 bits each.
+    Coordinates and logarithms of scales have 10 or 11 bits for their range in a chunk. Spherical harmonics have steps
+    of 1/32 between -4 and 4.
 
     Args:
         parameters: Finite parameters by splatfacto's names. Spherical harmonics of degree 4 are left out.
@@ -154,7 +154,7 @@ def _unmatched(path: Path, problem: str) -> InputError:
 
 
 def _bounds(chunk: np.ndarray, group: str, n: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return the lower and the upper bounds of the chunk of each Gaussian."""
+    """Return, for each Gaussian, the lower and the upper bounds of its chunk."""
     table = torch.from_numpy(np.stack([chunk[name].astype(np.float32) for name in _BOUNDS[group]], axis=1))
     rows = table.repeat_interleave(_CHUNK_ROWS, 0)[:n]
     return rows[:, :3], rows[:, 3:]
@@ -204,7 +204,7 @@ def _element(name: str, columns: Mapping[str, np.ndarray], kind: str) -> PlyElem
 
 
 def _chunk_order(means: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-    """Return the rows in the order of a k-d tree, so that each chunk covers a small box."""
+    """Return the row indices in the order of a k-d tree, so that each chunk covers a small box."""
     weights = 1 / (2.0 ** np.array(_POSITION_BITS) - 1)
     chunks, boxes = [], [np.arange(len(means))]
     while len(boxes) > 0:

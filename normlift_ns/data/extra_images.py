@@ -26,12 +26,12 @@ maximum rotation in degrees."""
 def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None) -> AnyScene:
     """Return the scene with extra images added to its training views.
 
-    The camera file must contain new images and images of the scene. Images are matched by name, and the cameras of the
-    known images align the world of the file with the world of the scene. Held-out images of the scene are not new.
+    The camera file must contain new images and known images, which are training or held-out images of the scene. Images
+    are matched by name. The cameras of the known images align the world of the file with the world of the scene.
 
     Args:
         scene: Scene to extend.
-        cameras: Folder of a COLMAP project, or a transforms.json or its folder, with new and known images.
+        cameras: Folder of a COLMAP project, transforms.json, or folder of a transforms.json.
         images: Folder of the images; if None, the default of `SplatOptions.images`.
     Raises:
         FileNotFoundError, ValueError: As in `read_camera_file` and `with_frames`. Also if no image is new, fewer than

@@ -20,7 +20,7 @@ The share is smaller only if too many pixels lie beyond `MAX_ANGLE`.
 """
 MAX_ANGLE = math.radians(80)
 """Largest angle to the optical axis, in radians, of the pixels that count as kept. A pinhole camera cannot show
-directions near 90 degrees. Pixels that the distortion model does not reach count as beyond this angle."""
+directions near 90 degrees. Pixels without an angle in the distortion model count as beyond this angle."""
 _MIN_SHARE = 0.1
 """Minimum share of pixels within `MAX_ANGLE`. If the share is smaller, the distortion is probably wrong."""
 _SAMPLES, _SAMPLING_ERROR = 512, 1e-3
@@ -78,7 +78,7 @@ def _pinhole(lens: Intrinsics) -> _Pinhole:
 def _focal_limits(lens: Intrinsics) -> Float[np.ndarray, " n"]:
     """Return, for each sampled pixel, the largest factor on the focal lengths that keeps it inside the pinhole image.
 
-    The factor is 0 for pixels beyond `MAX_ANGLE`, and for pixels that the distortion model does not reach.
+    The factor is 0 for pixels beyond `MAX_ANGLE`, and for pixels without an angle in the distortion model.
     """
     size, center = np.array([lens.width, lens.height], float), np.array(lens[2:4], float)
     grid = np.meshgrid(*((np.arange(_SAMPLES) + 0.5) * side / _SAMPLES for side in size))

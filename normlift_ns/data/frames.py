@@ -27,7 +27,7 @@ class ImageHeader(NamedTuple):
     """Header of an image file."""
 
     size: tuple[int, int]
-    """Width and height in pixels, without EXIF rotation."""
+    """Width and height in pixels, before any EXIF rotation."""
     mode: str
     """Pillow's name for the pixel format."""
     rotated: bool
@@ -262,7 +262,7 @@ def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *
         folder: Folder to search.
         source: Path of the camera file, for error messages.
         advice: Advice on missing images, for error messages.
-        allow_copies: True to also find copies of the images whose paths lack leading folders of the names.
+        allow_copies: True to also find copies whose paths lack leading folders of the image names.
     Raises:
         FileNotFoundError: Images are missing. The message gives their number and the first name.
         ValueError: Two names refer to the same file.
@@ -292,13 +292,13 @@ def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Pat
     """Return the possible paths of a file that a camera file names, in order of preference.
 
     An absolute path may be from another machine, so its trailing parts, such as images/1.png of
-    C:\\scene\\images\\1.png, are tried in the folder as well.
+    C:\\scene\\images\\1.png, are also joined to the folder.
 
     Args:
         folder: Folder to search.
         name: Absolute path, or path relative to the folder.
         copies: True for a folder of copies, such as images_2, in which leading folders of relative paths may be
-            missing. An absolute path itself is then not tried.
+            missing. An absolute path itself is then left out.
     """
     plain = plain_name(name)
     path = PureWindowsPath(plain) if PureWindowsPath(plain).is_absolute() else PurePosixPath(plain)

@@ -114,9 +114,9 @@ def read_gltf(path: Path) -> SplatFile:
 
     Raises:
         FileNotFoundError: The file, or the file of a buffer, does not exist.
-        ValueError: The file is damaged or not a glTF file with exactly one splat. It needs an unsupported extension or
-            setting, places the splat several times or by a transform that is not a similarity, or has Gaussians that
-            cannot be rendered.
+        ValueError: The file is damaged or not a glTF file with exactly one splat. Also if it needs an unsupported
+            extension or setting, places the splat several times or by a transform that is not a similarity, or has
+            Gaussians that cannot be rendered.
     """
     if not path.is_file():
         raise FileNotFoundError(f"The glTF file {path} does not exist. Give an existing file with --load-ply.")

@@ -1,4 +1,4 @@
-"""Reader for cfg.yml, the settings that gsplat's trainer stores next to ckpts/ and ply/."""
+"""Reader for cfg.yml, the settings file that gsplat's trainer stores next to ckpts/ and ply/."""
 
 from __future__ import annotations
 

@@ -198,7 +198,7 @@ def check_array(
         name: Name of the array, for the error message.
         low, high: Bounds of its values, both inclusive. NaN is always out of range.
     Raises:
-        ValueError: The array differs. The message gives the actual and the expected properties.
+        ValueError: The array is not as expected. The message gives the actual and the expected properties.
 
     >>> check_array("means", np.zeros((2, 3), np.float32), "float32", (2, 3), 0)
     """
@@ -241,7 +241,7 @@ _HEADER_READERS = {
     (3, 0): np.lib.format.read_array_header_2_0,  # differs only in the names of records, which are not read
 }
 _NUMERIC_KINDS = "biuf"
-"""NumPy's codes of booleans, signed and unsigned integers, and floats."""
+"""NumPy's codes for booleans, signed and unsigned integers, and floats."""
 _MAX_NUMBERS = 2**60
 """Upper limit for the product of the dimensions of an array, with dimensions of 0 counted as 1."""
 

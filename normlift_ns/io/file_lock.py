@@ -4,8 +4,8 @@ A claim is a file KEY.NUMBER for attempt NUMBER at task KEY. Only the latest att
 with O_EXCL, so only one process owns an attempt, even on network drives. The owner writes a heartbeat into the file,
 and creates KEY.NUMBER.OUTCOME when the attempt ends. If the heartbeat stops, another process claims the next attempt.
 
-Claim files are never deleted, so no process can delete the claim of another process. Each process measures heartbeats
-with its own clock, so the clocks of different machines may differ.
+Claim files are never deleted, because a process could otherwise delete the claim of another one. Each process measures
+heartbeats with its own clock, so the clocks of different machines may differ.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def try_claim(folder: Path, key: str, after: int) -> Claim | None:
     """Claim the next attempt at a task; return None if another process claimed it first.
 
     Args:
-        key: Name of the task, made of lower-case letters, digits, - and _.
+        key: Name of the task, made of lowercase letters, digits, - and _.
         after: Number of the latest attempt, as in `ClaimState`.
     Raises:
         OSError: The folder cannot be written.
@@ -152,7 +152,7 @@ def finish_claim(claim: Claim, outcome: str) -> None:
     """Record the outcome of an attempt, so that other processes stop waiting for it.
 
     Args:
-        outcome: Word of lower-case letters. After `ABANDONED`, any process may claim the task immediately.
+        outcome: Word of lowercase letters. After `ABANDONED`, any process may claim the task immediately.
     Raises:
         OSError: The folder cannot be written.
     """

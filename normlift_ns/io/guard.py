@@ -162,7 +162,7 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "") -> None:
 
     Args:
         path: Path of the output. If it does not exist, the function returns without a check.
-        kind: Kind of the output, as `file_kind` returns it; None if it is not known yet and is not compared.
+        kind: Kind of the output, as `file_kind` returns it; None if it is not known yet; kinds are then not compared.
         flags: Flags for choosing the output, for the error message; empty if there are none.
     Raises:
         ValueError: `path` is a folder, a pipe, a device or a broken link, cannot be read, or is of a different kind.
@@ -208,7 +208,7 @@ def file_kind(path: Path) -> str:
 
 
 def suffix_kind(path: Path) -> str | None:
-    """Return the kind of a file, which is the suffix of its path in lower case; None for an unknown suffix."""
+    """Return the kind of a file, which is the suffix of its path in lowercase; None for an unknown suffix."""
     return suffix if (suffix := path.suffix.lower()) in {*_KINDS, ".json", ".npz"} else None
 
 

@@ -148,7 +148,7 @@ def check_run(run_dir: Path) -> None:
 
 
 def run_file_digests(folder: Path, files: Iterable[Path]) -> dict[str, str]:
-    """Return digests of files of a run, by path relative to the field folder.
+    """Return the digests of files of a run, by path relative to the field folder.
 
     Files that do not exist or are not part of the run are left out.
     """
