@@ -22,7 +22,7 @@ MAX_ANGLE = math.radians(80)
 """Largest angle to the optical axis, in radians, of the pixels that count as kept. A pinhole camera cannot show
 directions near 90 degrees. Pixels without an angle in the distortion model count as beyond this angle."""
 _MIN_SHARE = 0.1
-"""Minimum share of pixels within `MAX_ANGLE`. If the share is smaller, the distortion is probably wrong."""
+"""Minimum share of pixels within `MAX_ANGLE`. Below it, the focal length or the distortion is probably wrong."""
 _SAMPLES, _SAMPLING_ERROR = 512, 1e-3
 """Number of rows and of columns of the sample grid for estimates of shares, and maximum error of these estimates."""
 _ANGLES = np.linspace(0, math.radians(89.9), 8192)

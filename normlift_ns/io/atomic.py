@@ -91,7 +91,7 @@ def acquire_lock(folder: Path) -> int | None:
     Returns:
         The file descriptor for `release_lock`, or None if the system or the file system does not support locks.
     Raises:
-        BlockingIOError: Another process holds the lock.
+        BlockingIOError: The folder is already locked.
         OSError: The folder does not exist or cannot be opened.
     """
     if sys.platform == "win32":
@@ -120,7 +120,7 @@ def release_lock(descriptor: int | None) -> None:
 def locked(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder within a `with` block.
 
-    If another process holds the lock, wait for at most 60 s, and then continue without the lock.
+    If the folder is already locked, wait for at most 60 s, and then continue without the lock.
     """
     descriptor, deadline = None, time.monotonic() + _LOCK_TIMEOUT
     while time.monotonic() < deadline:
@@ -289,7 +289,7 @@ class NotWrittenError(OSError):
 def atomic_files(
     *paths: Path, overwrite: bool = False, delete: Sequence[Path] = (), own: bool = False
 ) -> Iterator[tuple[Path, ...]]:
-    """Yield a temporary path for each path; when the block ends, rename all files to their final paths together.
+    """Yield a temporary path for each path; if the block succeeds, rename all files to their final paths together.
 
     If two processes write the same paths simultaneously, their files are never mixed. If this process dies between the
     first rename and the last, the next process that writes to the folder completes the renames.
