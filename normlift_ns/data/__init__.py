@@ -1,1 +1,1 @@
-"""Readers of trained splats and their training images, which make them available as a `core.scene.Scene`."""
+"""Readers that load a trained splat and its training images as a `core.scene.Scene`."""

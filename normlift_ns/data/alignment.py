@@ -1,4 +1,4 @@
-"""Comparison of a few renders with their images before a lift, to detect cameras that do not match the splat."""
+"""Comparison of a few renders with training images before a lift, to detect cameras that do not match the splat."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from normlift_ns.io.arrays import array_digest, load_arrays, save_arrays
 from normlift_ns.rasterization.settings import RasterSettings
 
 MIN_PSNR = 24.0
-"""Usual minimum PSNR in dB. Real scenes reach 25 to 40 dB on their training images."""
+"""Lower bound of the usual PSNR in dB. Real scenes reach 25 to 40 dB on their training images."""
 MIN_MARGIN = 3.0
-"""Minimum `Alignment.margin` in dB. In `python -m research.worlds`, the margin is smaller for cameras in a wrong world,
-and at least 4 dB for cameras in the right world."""
+"""Minimum `Alignment.margin` in dB. In `python -m research.worlds`, the margin is smaller for cameras in the wrong
+world, and at least 4 dB for cameras in the right world."""
 _MIN_VISIBLE = 0.001
 """Minimum `Alignment.visible_fraction`."""
 _CACHE_VERSION = "normlift_ns.alignment/1"
-"""Version in every cache key; increase it when `cached_alignment` changes for the same input."""
+"""Version in every cache key; increase it when `measure_alignment` returns a different result for the same input."""
 
 
 class Alignment(NamedTuple):
@@ -39,15 +39,15 @@ class Alignment(NamedTuple):
     psnr: float
     """Mean PSNR of the renders, in dB."""
     worst: tuple[str, float]
-    """Name and PSNR in dB of the image with the lowest PSNR."""
+    """Name of the image whose render has the lowest PSNR, and this PSNR in dB."""
     visible_fraction: float
-    """Largest fraction of all Gaussians that one of the views contains, in 0..1."""
+    """Largest fraction over the views, in 0..1, of Gaussians whose centers project into the image."""
     mean_color_psnr: float
     """Mean PSNR in dB if each image is compared with its mean color instead of a render."""
     margin: float
-    """Median lead over the views, in dB: the PSNR of the render minus the PSNR of the image's mean color."""
+    """Median over the views, in dB, of the PSNR of the render minus the PSNR of the image's mean color."""
     cause: str | None = None
-    """Sentence about another lens or primitive that fits the images better; None if none was found or searched."""
+    """Sentence about another lens or primitive that fits the images better; None if no search found one."""
 
     @property
     def is_usual(self) -> bool:
@@ -58,14 +58,13 @@ class Alignment(NamedTuple):
 def measure_alignment(
     scene: Scene, settings: RasterSettings | None = None, *, device: str = "cpu", explain: bool = True
 ) -> Alignment:
-    """Render the views of `sample_views`, and compare the renders with the images.
+    """Render the views that `sample_views` selects, and compare the renders with the images.
 
     Args:
         scene: Gaussians, cameras and images.
-        settings: Constants of the rasterizer at the original image size. None: the constants that the scene records.
+        settings: Constants of the rasterizer at the original image size. None: the constants recorded in the scene.
         device: torch device to render on.
-        explain: False to skip the search for a `cause` if the renders do not reach the usual PSNR or margin; see
-            `explain_misfit`.
+        explain: If False, search for a `cause` with `explain_misfit` only if `Alignment.is_usual` is True.
     Raises:
         FileNotFoundError, ValueError: An image is missing or cannot be read.
     """
@@ -93,11 +92,12 @@ def cached_alignment(
 ) -> Alignment:
     """Return the result of `measure_alignment` from a cache, or compute and store it.
 
-    Results of different devices count as equal, because they differ only by rounding.
+    Results of different devices count as equal, because they differ only by rounding. Results for scenes that another
+    package renders are not cached.
 
     Args:
         folder: Folder of the cache. It may be missing or read-only.
-        wait_for_kernels: Called before views are rendered.
+        wait_for_kernels: Function that is called before the views are rendered.
         scene, settings, device: As in `measure_alignment`.
     """
     path = None if scene.renderer is not None else folder / f"{_alignment_key(scene, settings)}.safetensors"
@@ -129,7 +129,7 @@ def _alignment_key(scene: Scene, settings: RasterSettings) -> str:
 def _compare(
     gaussians: GaussianScene, views: Sequence[ReducedView], renders: Sequence[UInt8[Tensor, "h w 3"]]
 ) -> Alignment:
-    """Return the agreement of views with their renders, without a `cause`."""
+    """Compare the images of the views with their renders, without a search for a `cause`."""
     visible = max(float(in_frustum(gaussians.means, small.view.camera).float().mean()) for small in views)
     psnrs = {small.view.name: small.psnr(image) for small, image in zip(views, renders)}
     worst = min(psnrs, key=lambda name: psnrs[name])
@@ -145,7 +145,7 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
         match: Result of `measure_alignment`.
         trained_cameras: True if, according to the files, the splat was trained with these cameras.
     Raises:
-        ValueError: The views contain almost no Gaussians. Also if the margin is below `MIN_MARGIN` and
+        ValueError: The views contain almost none of the Gaussians. Also if the margin is below `MIN_MARGIN` and
             `trained_cameras` is False.
     """
     other_cameras = (
@@ -193,6 +193,6 @@ def alignment_warning(match: Alignment, *, trained_cameras: bool) -> str | None:
 
 
 def in_frustum(means: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, " n"]:
-    """Return a mask of the Gaussians whose centers are inside the image and in front of the camera."""
+    """Return a mask of the Gaussians whose centers are in front of the camera and project into the image."""
     _, _, depth, inside = camera.project(means)
     return inside & (depth > 0)

@@ -20,14 +20,14 @@ _PARALLEL = 1e-6
 
 
 def read_camera_file(options: SplatOptions, advice: str | None = None) -> CameraFile:
-    """Read the camera file that the options name, and check that its images exist.
+    """Read the camera file that the options name, and scale its intrinsics to the sizes of the images.
 
     Args:
         options: Paths of cameras, images and masks.
         advice: Advice on missing images, for error messages; None for advice that depends on the options.
     Raises:
         FileNotFoundError: A file, folder, image or mask is missing.
-        ValueError: The options do not contain exactly one camera file, or this file, an image or a mask is not valid.
+        ValueError: The options do not name exactly one camera file, or this file, an image or a mask is not valid.
     """
     count = (options.colmap is not None) + (options.transforms is not None)
     if count != 1:
@@ -59,10 +59,10 @@ def adjust_poses(
     Args:
         frames: Frames of all images.
         held_out: Names of the images that the training did not use; their poses stay unchanged.
-        deltas: Adjustments of the training views, as in `SplatFile.pose_adjust`.
+        deltas: Adjustments of the training views in the order of `frames`, as in `SplatFile.pose_adjust`.
         path: File of the splat, for error messages.
     Raises:
-        ValueError: The numbers of adjustments and training views differ, or an adjustment is not a rotation.
+        ValueError: The numbers of adjustments and training views differ, or the rotation of an adjustment is not valid.
     """
     trained = [frame for frame in frames if frame.name not in held_out]
     if len(trained) != len(deltas):

@@ -1,4 +1,4 @@
-"""Readers for nerfstudio and gsplat checkpoints that do not execute code from the files."""
+"""Readers for nerfstudio and gsplat checkpoints. They do not execute code from the files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ _MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")  # names in NumPy
 def allow_numpy_scalars() -> Iterator[None]:
     """Allow `torch.load(weights_only=True)` to read NumPy scalars within a `with` block.
 
-    torch before 2.4 cannot construct NumPy scalars, so they become None.
+    With torch 2.4, NumPy scalars stay allowed after the block. Earlier versions cannot construct them, and return None
+    instead.
     """
     if hasattr(torch.serialization, "safe_globals"):
         with torch.serialization.safe_globals(numpy_scalar_globals()):
@@ -85,7 +86,7 @@ def _unread(*_: object) -> None:
 def _unread_dtype(*_: object) -> torch.nn.Parameter:
     """Return a parameter in place of a NumPy dtype.
 
-    Old versions of torch construct objects with a custom state only if they are parameters.
+    Before version 2.4, torch calls `__setstate__` only on parameters.
     """
     stand_in: Any = torch.nn.Parameter(torch.empty(0))
     stand_in.__setstate__ = _unread
@@ -93,7 +94,7 @@ def _unread_dtype(*_: object) -> torch.nn.Parameter:
 
 
 def _renamed(function: Callable[..., Any], module: str, name: str) -> Callable[..., Any]:
-    """Return a function with another module and name, because torch's allow-list compares names."""
+    """Wrap a function under another module and name, because torch's allow-list compares names."""
 
     def alias(*args: Any) -> Any:
         return function(*args)
@@ -115,7 +116,7 @@ class Checkpoint(NamedTuple):
     path: Path
     step: int
     model: dict[str, Tensor]
-    """State of the model on the CPU, without LPIPS. The parameters of the Gaussians are in float32."""
+    """State of the model on the CPU, without the LPIPS network. The parameters of the Gaussians are in float32."""
     splat: SplatParameters
     """Parameters of the Gaussians, from gauss_params.* in the state."""
 
@@ -153,8 +154,8 @@ def _step_of(path: Path) -> int | None:
 def read_checkpoint(path: Path) -> Checkpoint:
     """Read the step and the model of a splatfacto checkpoint, without its optimizer states.
 
-    Parameters in float16, bfloat16 or float64 become float32, as in nerfstudio. Gaussians that are not finite are kept,
-    and are never drawn.
+    Parameters in float16, bfloat16 or float64 become float32, as in nerfstudio. Gaussians with values that are not
+    finite are kept, but never rendered.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -189,7 +190,7 @@ def validate_step(step: Any, path: Path) -> int:
     """Validate and return the training step of a checkpoint.
 
     Raises:
-        ValueError: The step is not a whole number in range, or differs from the step in the file name.
+        ValueError: The step is not a whole number from 0 to 999,999,999, or differs from the step in the file name.
     """
     step = int(step) if isinstance(step, np.integer) else step
     if type(step) is not int or not 0 <= step < _MAX_STEP:  # a bool is not a step
@@ -243,7 +244,7 @@ def load_torch_archive(path: Path, writer: str, advice: str) -> Any:
 def _check_archive(path: Path, advice: str) -> None:
     """Raise InputError unless a file is a ZIP archive with valid sizes and CRC-32 checksums, as torch.save writes it.
 
-    torch.load does not check them. Compressed entries are invalid, because torch.save never compresses.
+    torch.load checks neither sizes nor checksums. Compressed entries are invalid, because torch.save never compresses.
     """
     size = path.stat().st_size
     try:
@@ -271,7 +272,10 @@ def _check_archive(path: Path, advice: str) -> None:
 
 
 def _model_state(pipeline: dict[Any, Any], path: Path) -> dict[str, Tensor]:
-    """Return the tensors of the model by name, without the prefix `module.` that training on several GPUs adds."""
+    """Return the tensors of the model, except those of the LPIPS network, by name.
+
+    The prefixes `_model.` and `module.` are removed from the names. Training on several GPUs adds `module.`.
+    """
     state: dict[str, Tensor] = {}
     for name, value in pipeline.items():
         if not isinstance(name, str):
@@ -319,7 +323,7 @@ _GSPLAT_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 def read_gsplat_checkpoint(path: Path) -> SplatFile:
-    """Read ckpt_<step>_rank<r>.pt, with the files of all other ranks if the training used several GPUs.
+    """Read ckpt_<step>_rank<r>.pt, and the files of all other ranks if the training used several GPUs.
 
     Raises:
         FileNotFoundError: The file, or the file of another rank, does not exist.
@@ -373,7 +377,7 @@ class _Rank(NamedTuple):
 
     step: int
     parameters: dict[str, Tensor]
-    """Parameters of the Gaussians, by the names that splatfacto uses."""
+    """Parameters of the Gaussians, by splatfacto's names."""
     pose_adjust: Float[Tensor, "v 9"] | None
     remarks: tuple[str, ...]
     """Messages about parameters that are ignored."""
@@ -397,7 +401,7 @@ def _read_rank(path: Path) -> _Rank:
 
 
 def _splats(path: Path, loaded: Any) -> Mapping[str, Tensor]:
-    """Return the tensors in `splats` of a checkpoint, or raise InputError if they are not 3D Gaussians."""
+    """Return the `splats` of a checkpoint; raise InputError unless they are 3D Gaussians with spherical harmonics."""
     splats = loaded.get("splats") if isinstance(loaded, Mapping) else None
     if not isinstance(splats, Mapping):
         keys = sorted(map(str, loaded)) if isinstance(loaded, Mapping) else type(loaded).__name__

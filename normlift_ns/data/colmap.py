@@ -1,4 +1,4 @@
-"""COLMAP reconstructions in text and binary format."""
+"""Readers for COLMAP reconstructions in text and binary format."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _SIMPLE_IF_ZERO = {
     "SIMPLE_DIVISION": ("k",),
     "DIVISION": ("k",),
 }
-"""Camera models that equal one of `_MODELS` if the given parameters are zero."""
+"""Camera models that `Intrinsics` can represent only if these parameters are zero."""
 _MAX_SIDE, _MAX_VALUE = 2**16, 1e30
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 _ADVICE = "Copy the reconstruction again, or rewrite it with: colmap model_converter"
@@ -93,7 +93,7 @@ def _is_model(folder: Path) -> bool:
 
 
 def _count_images(model: Path) -> int:
-    """Return the number of registered images; 0 if the file cannot be read."""
+    """Return the number of registered images of a reconstruction; 0 if it cannot be read."""
     try:
         return len(_read(model, "images", _images_text, _images_binary))
     except (InputError, OSError):
@@ -195,10 +195,10 @@ def _check_images(images: list[ColmapImage], cameras: Mapping[int, ColmapCamera]
 def colmap_intrinsics(camera: ColmapCamera, model: Path) -> Intrinsics:
     """Return the intrinsics of a camera.
 
-    Models in `_SIMPLE_IF_ZERO` are supported only if they equal a simpler model.
+    Models in `_SIMPLE_IF_ZERO` are supported only if the parameters listed there are zero.
 
     Raises:
-        ValueError: `normlift_ns` cannot undistort images of this camera model.
+        ValueError: `normlift_ns` cannot undistort the images of this camera.
     """
     parameters: dict[str, Any] = {}
     if camera.model in (*_MODELS, *_SIMPLE_IF_ZERO):
@@ -259,7 +259,7 @@ def read_colmap(folder: Path, images: Path | None, masks: Path | None, *, advice
 
 
 def _check_formats(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage], model: Path) -> None:
-    """Raise InputError if a reconstruction has different cameras in its text files and its binary files."""
+    """Raise InputError if a reconstruction has different cameras or poses in its text files and its binary files."""
     if not all((model / f"{name}.{suffix}").is_file() for name in ("cameras", "images") for suffix in ("bin", "txt")):
         return
     others, other_images = read_colmap_model(model, text_first=True)

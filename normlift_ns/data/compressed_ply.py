@@ -1,7 +1,7 @@
 """Compressed PLY files of PlayCanvas, with chunks of 256 Gaussians and 16 bytes per Gaussian.
 
-Each chunk stores the bounds of its values. Spherical harmonics take one more byte per coefficient. The format is that
-of https://github.com/playcanvas/splat-transform.
+Each chunk stores the bounds of its values. Spherical harmonics take one additional byte per coefficient. The format
+is that of https://github.com/playcanvas/splat-transform.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor],
     """Return the parameters in a compressed PLY file, by splatfacto's names, and a message about rounding errors.
 
     Raises:
-        ValueError: Elements or properties are missing, or their numbers or types do not match.
+        ValueError: Elements or properties are missing, have the wrong type, or do not match in number.
     """
     elements = {element.name: element.data for element in data.elements}
     chunk, vertex, harmonics = elements.get("chunk"), elements["vertex"], elements.get("sh")
@@ -81,14 +81,15 @@ def unpack_compressed_ply(data: PlyData, path: Path) -> tuple[dict[str, Tensor],
 
 
 def encode_compressed_ply(parameters: Mapping[str, Tensor], name: str, comments: tuple[str, ...] = ()) -> CompressedPly:
-    """Encode Gaussians as a compressed PLY file, sorted so that each chunk covers a small box.
+    """Sort Gaussians into chunks that cover small boxes, and encode them as a compressed PLY file.
 
-    Opacities and colors have 8 bits; rotations have 10 bits per component. Positions and logarithms of scales have 10
-    or 11 bits for their range in a chunk. Spherical harmonics have steps of 1/32 between -4 and 4.
+    Opacities and color channels have 8 bits, and the three smaller components of a quaternion have 10 bits each.
+    Coordinates and logarithms of scales have 10 or 11 bits for their range in a chunk. Spherical harmonics have steps
+    of 1/32 between -4 and 4.
 
     Args:
         parameters: Finite parameters by splatfacto's names. Spherical harmonics of degree 4 are left out.
-        name: Name of the file, for the message.
+        name: Name of the file, for `CompressedPly.rounding`.
         comments: Comments for the header of the file.
     """
     rows = _chunk_order(parameters["means"].detach().cpu().numpy())
@@ -153,7 +154,7 @@ def _unmatched(path: Path, problem: str) -> InputError:
 
 
 def _bounds(chunk: np.ndarray, group: str, n: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return the lower and the upper bounds of the chunk of each Gaussian."""
+    """Return, for each Gaussian, the lower and the upper bounds of its chunk."""
     table = torch.from_numpy(np.stack([chunk[name].astype(np.float32) for name in _BOUNDS[group]], axis=1))
     rows = table.repeat_interleave(_CHUNK_ROWS, 0)[:n]
     return rows[:, :3], rows[:, 3:]
@@ -179,7 +180,7 @@ def _unpack_harmonics(path: Path, table: np.ndarray | None, n: int) -> Float[Ten
 
 
 def _units(words: Int64[Tensor, " n"], bits: tuple[int, ...]) -> Float[Tensor, "n k"]:
-    """Unpack unsigned numbers from the low bits of words, and scale each of them to 0..1."""
+    """Unpack unsigned integers from the low bits of words, and scale each of them to 0..1."""
     shifts = [sum(bits[i + 1 :]) for i in range(len(bits))]
     return torch.stack([(words >> s & (2**b - 1)).float() / (2**b - 1) for s, b in zip(shifts, bits)], dim=1)
 
@@ -192,7 +193,7 @@ def _words(units: Float[Tensor, "n k"], bits: tuple[int, ...]) -> Int64[Tensor, 
 
 
 def _chunk_bounds(values: Float[Tensor, "n c"]) -> tuple[Float[Tensor, "k c"], Float[Tensor, "k c"]]:
-    """Return the minimum and the maximum of each chunk as float32."""
+    """Return the minimum and the maximum of each column in every chunk, as float32."""
     chunks = values.split(_CHUNK_ROWS)
     return torch.stack([x.amin(dim=0) for x in chunks]).float(), torch.stack([x.amax(dim=0) for x in chunks]).float()
 
@@ -203,7 +204,7 @@ def _element(name: str, columns: Mapping[str, np.ndarray], kind: str) -> PlyElem
 
 
 def _chunk_order(means: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-    """Return an order of the rows, made with a k-d tree, in which each chunk covers a small box."""
+    """Return the row indices in the order of a k-d tree, so that each chunk covers a small box."""
     weights = 1 / (2.0 ** np.array(_POSITION_BITS) - 1)
     chunks, boxes = [], [np.arange(len(means))]
     while len(boxes) > 0:
@@ -243,9 +244,9 @@ def normalize_quats(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
 
 
 def split_largest(unit: Float[Tensor, "n 4"]) -> tuple[Int64[Tensor, " n"], Float[Tensor, "n 3"]]:
-    """Return the index of the largest component of unit quaternions, and their other three components.
+    """Return the index of the largest component (by magnitude) of each unit quaternion, and the other three components.
 
-    If the largest component is negative, the signs of the others are changed.
+    If the largest component is negative, the other three change their sign.
     """
     index = unit.abs().argmax(dim=1, keepdim=True)
     positive = unit * torch.where(unit.gather(1, index) < 0, -1.0, 1.0)  # q and -q are the same rotation

@@ -19,19 +19,19 @@ from normlift_ns.errors import InputError
 from normlift_ns.options import SplatOptions
 
 _MAX_SHIFT, _MAX_ROTATION = 1e-3, 0.1
-"""Tolerances for known cameras: shift relative to their largest distance from their mean position, and rotation in
-degrees."""
+"""Maximum shift of a known camera, as a fraction of the largest distance of known cameras from their mean position, and
+maximum rotation in degrees."""
 
 
 def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None) -> AnyScene:
     """Return the scene with extra images added to its training views.
 
-    The camera file must contain new images and images of the scene. Images are matched by name, and the cameras of the
-    known images align the world of the file with the world of the scene. Held-out images of the scene are not new.
+    The camera file must contain new images and known images, which are training or held-out images of the scene. Images
+    are matched by name. The cameras of the known images align the world of the file with the world of the scene.
 
     Args:
         scene: Scene to extend.
-        cameras: Folder of a COLMAP project, or a transforms.json, with old and new images.
+        cameras: Folder of a COLMAP project, transforms.json, or folder of a transforms.json.
         images: Folder of the images; if None, the default of `SplatOptions.images`.
     Raises:
         FileNotFoundError, ValueError: As in `read_camera_file` and `with_frames`. Also if no image is new, fewer than
@@ -63,7 +63,7 @@ def add_extra_images(scene: AnyScene, cameras: Path, images: Path | None = None)
 
 
 def _key(name: str) -> str:
-    """Return an image name without its top folder images/ or images_4/, which some camera files omit.
+    """Return an image name without a top folder such as images/ or images_4/, which some camera files omit.
 
     >>> _key("images_4/left/0001.jpg"), _key("0001.jpg")
     ('left/0001.jpg', '0001.jpg')
@@ -73,10 +73,10 @@ def _key(name: str) -> str:
 
 
 def _align(extended: CameraFile, known: dict[str, Camera]) -> WorldTransform:
-    """Fit the similarity from the world of the file to the world of the scene to their common cameras.
+    """Return the similarity from the world of the file to the world of the scene, fitted to their common cameras.
 
     Raises:
-        ValueError: There are fewer than two common cameras, or some have moved relative to each other.
+        ValueError: There are no two common cameras at different positions, or some have moved relative to each other.
     """
     old = [frame for frame in extended.frames if _key(frame.name) in known]
     source = np.stack([frame.pose for frame in old]) if len(old) > 0 else np.zeros((0, 3, 4))

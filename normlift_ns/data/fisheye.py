@@ -1,4 +1,4 @@
-"""Undistortion of fisheye images to pinhole cameras of the same size that keep most of the pixels."""
+"""Undistortion of fisheye images to pinhole images of the same size, which keep most of the pixels."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ The share is smaller only if too many pixels lie beyond `MAX_ANGLE`.
 """
 MAX_ANGLE = math.radians(80)
 """Largest angle to the optical axis, in radians, of the pixels that count as kept. A pinhole camera cannot show
-directions near 90 degrees. Pixels that the distortion model does not reach count as beyond this angle."""
+directions near 90 degrees. Pixels without an angle in the distortion model count as beyond this angle."""
 _MIN_SHARE = 0.1
-"""Minimum share of pixels within `MAX_ANGLE`. If the share is smaller, the distortion is probably wrong."""
+"""Minimum share of pixels within `MAX_ANGLE`. Below it, the focal length or the distortion is probably wrong."""
 _SAMPLES, _SAMPLING_ERROR = 512, 1e-3
-"""Number of rows and of columns of pixels from which shares are estimated, and the maximum error of the estimates."""
+"""Number of rows and of columns of the sample grid for estimates of shares, and maximum error of these estimates."""
 _ANGLES = np.linspace(0, math.radians(89.9), 8192)
 
 
@@ -36,7 +36,7 @@ def fisheye_pinhole(lens: Intrinsics) -> Float[np.ndarray, "3 3"]:
     `MAX_ANGLE`, it is the largest one that keeps all others inside.
 
     Raises:
-        ValueError: Less than a tenth of the pixels lie within `MAX_ANGLE`.
+        ValueError: Fewer than a tenth of the pixels lie within `MAX_ANGLE`.
     """
     return np.array(_pinhole(lens).matrix)
 
@@ -53,7 +53,7 @@ def kept_share(lens: Intrinsics) -> float:
 class _Pinhole(NamedTuple):
     matrix: tuple[tuple[float, float, float], ...]
     kept: float
-    """Share of the original pixels that are inside the image."""
+    """Share of the original pixels that are inside the pinhole image."""
 
 
 @lru_cache  # the images of a camera share their intrinsics
@@ -76,9 +76,9 @@ def _pinhole(lens: Intrinsics) -> _Pinhole:
 
 
 def _focal_limits(lens: Intrinsics) -> Float[np.ndarray, " n"]:
-    """Return the largest factor on the focal lengths that keeps each sampled pixel inside the pinhole image.
+    """Return, for each sampled pixel, the largest factor on the focal lengths that keeps it inside the pinhole image.
 
-    The factor is 0 for pixels beyond `MAX_ANGLE`, and for pixels that the distortion model does not reach.
+    The factor is 0 for pixels beyond `MAX_ANGLE`, and for pixels without an angle in the distortion model.
     """
     size, center = np.array([lens.width, lens.height], float), np.array(lens[2:4], float)
     grid = np.meshgrid(*((np.arange(_SAMPLES) + 0.5) * side / _SAMPLES for side in size))
@@ -92,8 +92,8 @@ def _focal_limits(lens: Intrinsics) -> Float[np.ndarray, " n"]:
 
 
 def _bent(angles: Float[np.ndarray, " n"], lens: Intrinsics) -> Float[np.ndarray, " n"]:
-    """Return the distances from the principal point, in focal lengths, of rays at the given angles to the optical
-    axis."""
+    """Return the distances of pixels from the principal point, in focal lengths, given the angles of their rays to the
+    optical axis."""
     square = angles**2
     return angles * (1 + square * (lens.k1 + square * (lens.k2 + square * (lens.k3 + square * lens.k4))))
 
@@ -106,7 +106,7 @@ def _last_angle(lens: Intrinsics) -> float:
 
 
 class _Sources(NamedTuple):
-    """Position in the original image of each pixel of the undistorted image, with pixel centers at integers."""
+    """Position in the original image for each pixel of the undistorted image, with pixel centers at integers."""
 
     x: Float32[np.ndarray, "h w"]
     y: Float32[np.ndarray, "h w"]
@@ -136,14 +136,14 @@ def filled_pixels(lens: Intrinsics) -> Bool[np.ndarray, "h w"]:
 
 
 def undistort_fisheye(image: UInt8[np.ndarray, "h w c"], lens: Intrinsics) -> UInt8[np.ndarray, "h w c"]:
-    """Undistort a fisheye image by linear interpolation. Pixels that the original image does not show become 0."""
+    """Undistort a fisheye image with bilinear interpolation. Pixels that the original image does not show become 0."""
     x, y, filled = _sources(lens)
     pixels = cv2.remap(image, x, y, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return pixels.reshape(*filled.shape, -1) * filled[:, :, None]
 
 
 def undistort_labels(maps: Int[np.ndarray, "levels h w"], lens: Intrinsics) -> Int64[np.ndarray, "levels h w"]:
-    """Undistort label maps of a fisheye image, in any size, without interpolation.
+    """Undistort label maps of a fisheye image, at any resolution, with nearest-neighbor sampling.
 
     Pixels that the original image does not show become -1.
     """

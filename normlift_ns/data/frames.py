@@ -20,16 +20,16 @@ _FORMATS = {"JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "DIB", "PPM", "GIF", "T
 _MAX_SIDE = 2**16
 _EXIF_ORIENTATION = 0x0112
 _SINGLE_CHANNEL = {"1", "L", "P", "I", "F"}
-"""Pillow modes with one number per pixel; modes that start with I;16 also have one."""
+"""Pillow modes with one number per pixel, in addition to the modes that start with I;16."""
 
 
 class ImageHeader(NamedTuple):
     """Header of an image file."""
 
     size: tuple[int, int]
-    """Width and height in pixels, without EXIF rotation."""
+    """Width and height in pixels, before any EXIF rotation."""
     mode: str
-    """Pillow's name of the pixel format."""
+    """Pillow's name for the pixel format."""
     rotated: bool
     """True if the EXIF data contain a rotation or a reflection, which training ignores."""
     multi_frame: bool
@@ -80,8 +80,8 @@ def check_mask(mask: Path, file: Path, size: tuple[int, int]) -> None:
         file: Path of its image, for error messages.
         size: Width and height of the image in pixels.
     Raises:
-        FileNotFoundError, ValueError: As in `read_image_header`; also if the mask has the wrong channels or the wrong
-            size, with both paths in the message.
+        FileNotFoundError, ValueError: As in `read_image_header`. Also if the mask has several channels or the wrong
+            size; the message then gives both paths.
     """
     header = read_image_header(mask)
     if header.mode not in _SINGLE_CHANNEL and not header.mode.startswith("I;16"):
@@ -135,9 +135,9 @@ PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """Fisheye camera models that `Intrinsics` can represent, by their names in COLMAP."""
 _SMALLEST = 1e-12
-"""Distortion parameter k1 of fisheye cameras without distortion, too small to move any pixel.
+"""Value of k1 that replaces 0 for fisheye cameras without distortion, too small to move any pixel.
 
-nerfstudio treats fisheye cameras without distortion as pinhole cameras.
+nerfstudio treats fisheye cameras as pinhole cameras if all their distortion parameters are exactly 0.
 """
 
 
@@ -172,7 +172,7 @@ class Intrinsics(NamedTuple):
         return any(self[6:12])
 
     def as_fisheye(self) -> Intrinsics:
-        """Return the intrinsics of a fisheye camera, with a distortion that is not zero."""
+        """Return these intrinsics as those of a fisheye camera, with a distortion that is not zero."""
         return self._replace(k1=self.k1 if self.is_distorted else _SMALLEST, fisheye=True)
 
     def resized(self, width: int, height: int) -> Intrinsics:
@@ -262,10 +262,10 @@ def find_images(names: Sequence[str], folder: Path, source: Path, advice: str, *
         folder: Folder to search.
         source: Path of the camera file, for error messages.
         advice: Advice on missing images, for error messages.
-        allow_copies: True if the folder may contain copies of the images, with leading folders of their paths missing.
+        allow_copies: True to also find copies whose paths lack leading folders of the image names.
     Raises:
-        FileNotFoundError: Images are missing. The message gives their number and the first of them.
-        ValueError: Two names lead to the same file.
+        FileNotFoundError: Images are missing. The message gives their number and the first name.
+        ValueError: Two names refer to the same file.
     """
     found = [_find_file(folder, name, copies=allow_copies) for name in names]
     missing = [name for name, file in zip(names, found) if file is None]
@@ -289,16 +289,16 @@ def plain_name(name: str) -> str:
 
 
 def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Path]:
-    """Return the possible paths of a file that a camera file names, in the order of preference.
+    """Return the possible paths of a file that a camera file names, in order of preference.
 
-    An absolute path may be from another machine, so its trailing parts are also tried in the folder. An example is
-    images/1.png for C:\\scene\\images\\1.png.
+    An absolute path may be from another machine, so its trailing parts, such as images/1.png of
+    C:\\scene\\images\\1.png, are also joined to the folder.
 
     Args:
         folder: Folder to search.
         name: Absolute path, or path relative to the folder.
         copies: True for a folder of copies, such as images_2, in which leading folders of relative paths may be
-            missing. The absolute path itself is not tried.
+            missing. An absolute path itself is then left out.
     """
     plain = plain_name(name)
     path = PureWindowsPath(plain) if PureWindowsPath(plain).is_absolute() else PurePosixPath(plain)
@@ -310,7 +310,7 @@ def possible_paths(folder: Path, name: str, *, copies: bool = False) -> list[Pat
 
 
 def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
-    """Return the first existing file of `possible_paths`, or None. It may have another or an additional suffix."""
+    """Return the first existing file of `possible_paths`, or None. The file may have another or an extra suffix."""
     for candidate in possible_paths(folder, name, copies=copies):
         for file in (
             *(candidate.with_name(candidate.name + suffix) for suffix in ("", *_SUFFIXES)),
@@ -324,7 +324,7 @@ def _find_file(folder: Path, name: str, *, copies: bool) -> Path | None:
 def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
     """Find the masks of images, and return their absolute paths.
 
-    The mask of name.jpg is name.jpg.png, as in COLMAP, or an image with the same name and any supported suffix.
+    The mask of name.jpg is name.jpg.png, as in COLMAP, or an image with the same stem and any supported suffix.
 
     Raises:
         FileNotFoundError: A mask is missing.
@@ -343,14 +343,14 @@ def find_masks(names: Sequence[str], folder: Path) -> list[Path]:
 
 
 def rescale_intrinsics(frame: Frame, source: Path, advice: str = GIVE_IMAGES) -> Frame:
-    """Return a frame with its intrinsics scaled to the size of its file, which may be a smaller copy of the image.
+    """Return a frame with its intrinsics scaled to the size of its image file, which may be a smaller copy.
 
     Args:
         frame: Frame as read from the camera file.
         source: Path of the camera file, for error messages.
         advice: Advice on an unsuitable image, for error messages.
     Raises:
-        FileNotFoundError: The file is missing.
+        FileNotFoundError: The image or its mask is missing.
         ValueError: The file is not an image, its aspect ratio differs from that of its camera, or its mask is not
             valid.
     """

@@ -1,4 +1,4 @@
-"""glTF files with the extension KHR_gaussian_splatting, binary (GLB) or with separate buffers.
+"""Reader and encoder for glTF files with the extension KHR_gaussian_splatting, binary (GLB) or with separate buffers.
 
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
 """
@@ -81,7 +81,7 @@ class _Node(msgspec.Struct, rename="camel"):
     mesh: int | None = None
     children: list[int] = []
     matrix: Annotated[list[float], msgspec.Meta(min_length=16, max_length=16)] | None = None
-    """Columns of a 4 x 4 matrix, which replaces rotation, scale and translation."""
+    """4 x 4 matrix in column-major order, which replaces rotation, scale and translation."""
     rotation: tuple[float, float, float, float] = (0, 0, 0, 1)
     """Quaternion (x, y, z, w)."""
     scale: tuple[float, float, float] = (1, 1, 1)
@@ -108,15 +108,15 @@ class _Gltf(NamedTuple):
 
 
 def read_gltf(path: Path) -> SplatFile:
-    """Read the splat of a glTF file, with the transforms of its node and the parents of the node.
+    """Read the splat of a glTF file, and apply the transforms of its node and of all ancestors of the node.
 
     The splat may be compressed as SPZ (KHR_gaussian_splatting_compression_spz_2).
 
     Raises:
         FileNotFoundError: The file, or the file of a buffer, does not exist.
-        ValueError: The file is damaged or not a glTF file with exactly one splat. It needs an unsupported extension or
-            setting, places the splat several times or with more than one scale, or has Gaussians that cannot be
-            rendered.
+        ValueError: The file is damaged or not a glTF file with exactly one splat. Also if it needs an unsupported
+            extension or setting, places the splat several times or by a transform that is not a similarity, or has
+            Gaussians that cannot be rendered.
     """
     if not path.is_file():
         raise FileNotFoundError(f"The glTF file {path} does not exist. Give an existing file with --load-ply.")
@@ -224,7 +224,7 @@ def _damaged(path: Path, problem: str) -> InputError:
 
 
 def _glb_chunks(path: Path) -> tuple[bytes, bytes]:
-    """Return the JSON chunk and the binary chunk of a GLB file; empty if a chunk is missing."""
+    """Return the JSON chunk and the binary chunk of a GLB file; empty bytes for a missing chunk."""
     with open_regular(path) as file:
         size = path.stat().st_size
         header = file.read(_HEADER.size)
@@ -246,7 +246,7 @@ def _glb_chunks(path: Path) -> tuple[bytes, bytes]:
 
 
 def _find_splat(gltf: _Gltf) -> tuple[int, _Primitive]:
-    """Return the index of the mesh of the only splat in a file, and the splat."""
+    """Return the mesh index and the primitive of the only splat in a file."""
     primitives = [(index, item) for index, mesh in enumerate(gltf.document.meshes) for item in mesh.primitives]
     splats = [(index, primitive) for index, primitive in primitives if _EXTENSION in primitive.extensions]
     if len(splats) != 1:
@@ -308,7 +308,7 @@ def _read_accessor(gltf: _Gltf, index: int, name: str, size: int) -> Float[np.nd
 
 
 def _find_accessor(gltf: _Gltf, index: int, name: str, size: int) -> tuple[_Accessor, str]:
-    """Return a dense accessor that has rows of `size` numbers, and the type of the numbers."""
+    """Return a dense accessor that has rows of `size` numbers, and the NumPy type of these numbers."""
     accessors = gltf.document.accessors
     accessor = accessors[index] if 0 <= index < len(accessors) else None
     if accessor is not None and (accessor.sparse is not None or accessor.buffer_view is None):
@@ -337,7 +337,7 @@ def _view_bytes(gltf: _Gltf, index: object) -> tuple[_BufferView, memoryview]:
 
 
 def _buffer_bytes(path: Path, buffer: _Buffer, binary: bytes) -> bytes:
-    """Return the bytes of a buffer, which come from the binary chunk, a data URI, or a file in the same folder."""
+    """Return the bytes of a buffer, which come from the binary chunk, a data URI, or a file next to the glTF file."""
     if buffer.uri is None:
         return binary
     head, comma, text = buffer.uri.partition(",")
@@ -361,7 +361,7 @@ def _buffer_bytes(path: Path, buffer: _Buffer, binary: bytes) -> bytes:
 def encode_glb(
     splat: SplatParameters, columns: Mapping[str, Float[np.ndarray, " n"]], extras: Mapping[str, Any]
 ) -> bytes:
-    """Encode Gaussians as a GLB file, without changing their coordinates. Numbers are float32, except in COLOR_0.
+    """Encode Gaussians as a GLB file, without changing their coordinates. Attributes are float32, except COLOR_0.
 
     Args:
         splat: Finite Gaussians. Spherical harmonics of degree 4 are left out.

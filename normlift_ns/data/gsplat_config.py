@@ -1,4 +1,4 @@
-"""Reader for cfg.yml, the settings that gsplat's trainer stores next to ckpts/ and ply/."""
+"""Reader for cfg.yml, the settings file that gsplat's trainer stores next to ckpts/ and ply/."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ADVICE = "Copy it from the training run again, or move the splat to a separate 
 
 
 class GsplatConfig(NamedTuple):
-    """Settings in a cfg.yml that affect rendering or the choice of training images; None for missing settings."""
+    """Settings in a cfg.yml that affect the world, the rendering or the training images; None for missing settings."""
 
     path: Path
     rasterize_mode: RasterizeMode | None
@@ -39,7 +39,8 @@ def find_gsplat_config(splat: Path) -> GsplatConfig | None:
     Returns:
         The settings, or None without a cfg.yml of gsplat's trainer.
     Raises:
-        ValueError: The file is damaged, or the splat was not trained as 3D or 2D Gaussians with pinhole cameras.
+        ValueError: The file is damaged, a setting is not valid, or the splat was not trained as 3D or 2D Gaussians with
+            pinhole cameras.
     """
     folder = splat.parent.parent if splat.parent.name in _FOLDERS else splat.parent
     path = next((folder / name for name in _NAMES if (folder / name).is_file()), None)

@@ -1,1 +1,1 @@
-"""Atomic file operations, data files with digests, and memory limits."""
+"""Atomic file operations, data files with digests, work claims, and checks of files and memory."""

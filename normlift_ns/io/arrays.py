@@ -1,8 +1,9 @@
 """Files of arrays: safetensors files with a digest of their whole content, and NPY files of other programs.
 
-Loading checks the digest before it returns any content. Saving and loading NumPy arrays does not import torch. The
-digest is the 128-bit XXH3. It detects damaged and misplaced files, but does not protect against forgery. One core of an
-AMD EPYC hashes 31 GB/s with XXH3 and 0.9 GB/s with BLAKE2b. A field of 44 MB takes 1.5 ms instead of 50 ms.
+Loading checks the digest before it returns any content. Saving or loading NumPy arrays does not import torch. The
+digest is a 128-bit XXH3 hash. It detects damaged and misplaced files, but does not protect against forgery. One core
+of an AMD EPYC hashes 31 GB/s with XXH3 and 0.9 GB/s with BLAKE2b. Hashing a field of 44 MB takes 1.5 ms instead of
+50 ms.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from normlift_ns.io.memory import check_free_memory
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 """Largest float32 number, the default upper bound of `check_array`."""
 _BLOCK = 2**20
-"""Number of float16 numbers that are compared at a time."""
+"""Number of float16 numbers that `_extremes` compares at a time."""
 _SMALL_FILE = 2**20
-"""Size in bytes up to which a file is read without a check of the free memory, which would take longer than reading."""
+"""Size in bytes up to which a file is read without checking the free memory, because the check would take longer."""
 DIGEST_KEY = "digest"
 """Metadata key of the digest."""
 _Array = Any
@@ -48,7 +49,7 @@ class ArrayFile(NamedTuple):
 
 
 def array_digest(arrays: Mapping[str, _Array], facts: Mapping[str, str], key: str = "") -> str:
-    """Return a digest over metadata, a key, and the names, types, shapes and values of arrays or tensors.
+    """Return a digest of metadata, a key, and the names, types, shapes and values of arrays or tensors.
 
     >>> import torch
     >>> table = {"a": np.eye(2)}
@@ -87,7 +88,7 @@ def save_arrays(
 
     Args:
         arrays: NumPy arrays only, or tensors only.
-        facts: Further metadata.
+        facts: Metadata in addition to the digest.
         key: Key of the file in a cache. Loading the file with a different key raises an error.
         overwrite: Replace an existing file.
     Raises:
@@ -197,7 +198,7 @@ def check_array(
         name: Name of the array, for the error message.
         low, high: Bounds of its values, both inclusive. NaN is always out of range.
     Raises:
-        ValueError: The array differs. The message gives the actual and the expected properties.
+        ValueError: The array is not as expected. The message gives the actual and the expected properties.
 
     >>> check_array("means", np.zeros((2, 3), np.float32), "float32", (2, 3), 0)
     """
@@ -240,7 +241,7 @@ _HEADER_READERS = {
     (3, 0): np.lib.format.read_array_header_2_0,  # differs only in the names of records, which are not read
 }
 _NUMERIC_KINDS = "biuf"
-"""NumPy's codes of booleans, signed and unsigned integers, and floats."""
+"""NumPy's codes for booleans, signed and unsigned integers, and floats."""
 _MAX_NUMBERS = 2**60
 """Upper limit for the product of the dimensions of an array, with dimensions of 0 counted as 1."""
 

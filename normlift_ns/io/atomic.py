@@ -80,18 +80,18 @@ _NO_REPLACE, _EXCHANGE = 1, 2
 _AT_FDCWD = -100
 """Linux constant for renameat2: relative paths start at the working directory."""
 _LOCK_TIMEOUT = 60.0
-"""Maximum time to wait for a lock, in seconds. normlift_ns itself holds locks only briefly."""
+"""Maximum time in seconds that `locked` waits for a lock. normlift_ns itself holds such locks only briefly."""
 _UNSUPPORTED = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM}
 """Error codes of renameat2 if the kernel, the file system or the container does not support it."""
 
 
 def acquire_lock(folder: Path) -> int | None:
-    """Lock a folder until the caller calls `release_lock` or the process ends or is killed.
+    """Lock a folder until the caller calls `release_lock` or the process ends.
 
     Returns:
-        The file descriptor for `release_lock`, or None if the system does not support locks.
+        The file descriptor for `release_lock`, or None if the system or the file system does not support locks.
     Raises:
-        BlockingIOError: Another process holds the lock.
+        BlockingIOError: The folder is already locked.
         OSError: The folder does not exist or cannot be opened.
     """
     if sys.platform == "win32":
@@ -111,16 +111,16 @@ def acquire_lock(folder: Path) -> int | None:
 
 
 def release_lock(descriptor: int | None) -> None:
-    """Release the lock that `acquire_lock` returned; do nothing if the descriptor is None."""
+    """Release the lock of a descriptor from `acquire_lock`; do nothing if the descriptor is None."""
     if descriptor is not None:
         os.close(descriptor)
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder within a `with` block, after waiting for the lock for at most 60 s.
+    """Hold the lock of a folder within a `with` block.
 
-    If another process still holds the lock after that time, continue without it.
+    If the folder is already locked, wait for at most 60 s, and then continue without the lock.
     """
     descriptor, deadline = None, time.monotonic() + _LOCK_TIMEOUT
     while time.monotonic() < deadline:
@@ -182,11 +182,11 @@ _KEY_FILE, _KEY_BYTES, _MAX_JOURNAL_BYTES = "key", 32, 2**20
 
 
 def write_journal(temporary: Path, steps: Mapping[str, Any]) -> Path:
-    """Write a journal atomically, before files move from a temporary folder into its parent; return its path.
+    """Write a journal of the steps that move files from a temporary folder into its parent, and return its path.
 
     Args:
         temporary: Temporary folder with the new files, in which the journal is written.
-        steps: Either `files`, `remove` and `overwrite`, or `place`, `new` and `old`. File names have no folder part.
+        steps: Entries `files`, `remove` and `overwrite`, or `place`, `new` and `old`. File names have no folder part.
     """
     draft, journal = temporary / "steps.json", temporary / f"steps{JOURNAL_SUFFIX}"
     text = json.dumps(steps)
@@ -200,7 +200,7 @@ def complete_journal(temporary: Path) -> bool:
     """Complete or undo the steps in the journal of a temporary folder.
 
     Returns:
-        True if all steps are done or no journal exists; False if this user did not write the journal.
+        True if all steps are completed or undone, or no journal exists; False if the journal has no valid signature.
     """
     journal = temporary / f"steps{JOURNAL_SUFFIX}"
     if not os.path.lexists(journal):
@@ -247,7 +247,7 @@ def _signature(temporary: Path, text: str) -> str:
 
 @cache
 def _key() -> bytes:
-    """Return the user's key of 32 bytes, which is created at the first call.
+    """Return the user's key of 32 bytes, and create it if it does not exist.
 
     If the key cannot be stored, return a new key that only this process uses.
     """
@@ -289,7 +289,7 @@ class NotWrittenError(OSError):
 def atomic_files(
     *paths: Path, overwrite: bool = False, delete: Sequence[Path] = (), own: bool = False
 ) -> Iterator[tuple[Path, ...]]:
-    """Yield a temporary path for each path; when the block ends, rename all files to their final paths together.
+    """Yield a temporary path for each path; if the block succeeds, rename all files to their final paths together.
 
     If two processes write the same paths simultaneously, their files are never mixed. If this process dies between the
     first rename and the last, the next process that writes to the folder completes the renames.
@@ -303,7 +303,8 @@ def atomic_files(
         FileExistsError: A path exists, and `overwrite` is False.
         ValueError: The errors of `refuse_inputs`. With `overwrite`, also if an existing file is of a different kind. No
             file has changed.
-        NotWrittenError: Writing failed, for instance because the disk is full. No file has changed.
+        NotWrittenError: Writing failed, for instance because the disk is full. No file has changed unless a rename
+            failed.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "new folder" / "a.txt"
@@ -367,10 +368,11 @@ def commit_directory(draft: Path, path: Path, *, replaced: Callable[[Path], Coll
     that opens or writes the run completes them.
 
     Args:
-        replaced: Function that returns the files of an existing folder that the new folder replaces, as relative
-            paths. All other files are kept.
+        replaced: Function that returns the relative paths of the files in an existing folder that the new folder
+            replaces. All other files are kept.
     Raises:
-        ValueError: Both folders have a file that is not in `replaced`. No file has changed.
+        ValueError: Both folders have a file at the same path, and `replaced` does not return this path. The existing
+            folder is unchanged.
     """
     _flush(draft)
     with locked(path.parent):
@@ -417,7 +419,10 @@ def _link_others(old: Path, new: Path, replaced: Collection[str], *, keep_new: b
 
 
 def _rename_drafts(temporary: Path, drafts: Sequence[Path], overwrite: bool, remove: Sequence[Path]) -> Path | None:
-    """Rename drafts to their final paths; return the path that another program has created meanwhile, or None."""
+    """Rename drafts to their final paths, and delete the files in `remove`.
+
+    Return a path that another program has created in the meantime, or None.
+    """
     journal, folder = None, temporary.parent
     if len(drafts) + len(remove) > 1:
         complete_interrupted_writes(folder)  # if completed later, an older export would overwrite this one
@@ -476,7 +481,7 @@ def deferred_signals() -> Iterator[None]:
 
 @contextmanager
 def _draft_folder(*paths: Path) -> Iterator[Path]:
-    """Yield a temporary folder next to the paths. Error messages give these paths, not the temporary ones."""
+    """Yield a temporary folder next to the paths. Error messages give the paths, not those in the temporary folder."""
     folder, temporary = paths[0].parent, None
     new_folders = [place for place in (folder, *folder.parents) if not place.exists()]
     try:

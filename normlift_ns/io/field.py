@@ -69,7 +69,7 @@ class EvidenceArrays(NamedTuple):
     region_view: Int32[np.ndarray, " s"]
     unlabeled: RowArrays
     counts: tuple[int, int, int]
-    """Number of views, exponent of the weights A_ij in the sums, and number of excluded Gaussians."""
+    """Number of views, exponent of the weights A_ij in the evidence, and number of Gaussians that were not rendered."""
     digest: str | None
     """Digest of the content; None for files of version 0.1."""
 
@@ -81,7 +81,7 @@ class FieldArrays(NamedTuple):
     arrays: dict[str, np.ndarray]
     """Arrays by name: `source`, the scalars, `means` (since version 0.2), and `null_level` if the lift computed it.
 
-    Fields that store evidence also have `features`. Other fields have `coordinates`; low-rank fields also have `basis`.
+    Fields that store evidence have `features`. All others have `coordinates`, and low-rank fields have `basis` as well.
     """
     evidence: EvidenceArrays | None
     """Evidence for storage "evidence"; None for the other storage forms."""

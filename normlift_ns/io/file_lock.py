@@ -1,11 +1,11 @@
 """Work claims for processes that share a folder, without locks.
 
 A claim is a file KEY.NUMBER for attempt NUMBER at task KEY. Only the latest attempt is valid. Processes create claims
-with O_EXCL, so only one process owns an attempt, on network drives too. The owner writes a heartbeat into the file, and
-creates KEY.NUMBER.OUTCOME when the attempt ends. If the heartbeat stops, another process claims the next attempt.
+with O_EXCL, so only one process owns an attempt, even on network drives. The owner writes a heartbeat into the file,
+and creates KEY.NUMBER.OUTCOME when the attempt ends. If the heartbeat stops, another process claims the next attempt.
 
-Claim files are never deleted, so no process can delete the claim of another process. Each process measures heartbeats
-with its own clock, so the clocks of different machines may differ.
+Claim files are never deleted, because a process could otherwise delete the claim of another one. Each process measures
+heartbeats with its own clock, so the clocks of different machines may differ.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def claim_states(names: Iterable[str]) -> dict[str, ClaimState]:
     """Return the states of all tasks that have claim files, by key.
 
     Args:
-        names: Names of all files in the folder; names of other files are ignored.
+        names: Names of all files in the folder. Files other than claims are ignored.
 
     >>> claim_states(["a.1", "a.1.left", "a.2", "b.1", "b.1.done", "notes.txt"])
     {'a': ClaimState(number=2, outcome=None), 'b': ClaimState(number=1, outcome='done')}
@@ -106,7 +106,7 @@ def try_claim(folder: Path, key: str, after: int) -> Claim | None:
     """Claim the next attempt at a task; return None if another process claimed it first.
 
     Args:
-        key: Name of the task, made of lower-case letters, digits, - and _.
+        key: Name of the task, made of lowercase letters, digits, - and _.
         after: Number of the latest attempt, as in `ClaimState`.
     Raises:
         OSError: The folder cannot be written.
@@ -152,7 +152,7 @@ def finish_claim(claim: Claim, outcome: str) -> None:
     """Record the outcome of an attempt, so that other processes stop waiting for it.
 
     Args:
-        outcome: Word of lower-case letters. After `ABANDONED`, other processes may claim the task immediately.
+        outcome: Word of lowercase letters. After `ABANDONED`, any process may claim the task immediately.
     Raises:
         OSError: The folder cannot be written.
     """
@@ -178,8 +178,8 @@ def iter_claims(
 
     Args:
         keys: Names of the tasks.
-        initial_states: Result of `read_claim_states` before the caller listed its tasks. Attempts that had already
-            ended are repeated. Attempts that end later are repeated only if their outcome is `ABANDONED`.
+        initial_states: Result of `read_claim_states` before the caller listed its tasks. Attempts that had ended
+            by then are repeated. Attempts that end later are repeated only if their outcome is `ABANDONED`.
         timeout: Seconds without a heartbeat after which another process may take over a task.
         clock: Function that returns the time in seconds; tests replace it.
         sleep: Function that waits for a number of seconds; tests replace it.

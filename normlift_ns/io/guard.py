@@ -48,7 +48,7 @@ def _open_at_once(path: str, flags: int) -> int:
 
 
 def check_regular(path: str | Path, *, max_bytes: int | None = None) -> None:
-    """Raise the errors of `open_regular` if a path is not a regular file that another library may open."""
+    """Raise the errors of `open_regular` before another library opens a file."""
     open_regular(path, max_bytes=max_bytes).close()
 
 
@@ -81,7 +81,7 @@ _OWNERS = (
     *(("data set", (name,), _DATA_SET) for name in ("transforms.json", "sparse/0", "sparse/cameras.bin")),
     *(("data set", (name,), _DATA_SET) for name in ("sparse/cameras.txt", "colmap/sparse", "database.db")),
 )
-"""Kind of folder, the entries that identify it, and a pattern for all entries that belong to it."""
+"""Kinds of folders, each with the entries that identify it and a pattern for all entries that belong to it."""
 _KINDS = {
     ".ply": rb"ply\r?\n", ".png": rb"\x89PNG\r\n\x1a\n", ".npy": rb"\x93NUMPY", ".jpg": rb"\xff\xd8\xff",
     ".glb": rb"glTF", ".spz": rb"\x1f\x8b|NGSP",
@@ -112,7 +112,7 @@ def refuse_inputs(paths: Iterable[Path], *, instead: str = "path") -> None:
     Args:
         instead: Flags for choosing another path, quoted in the error message.
     Raises:
-        ValueError: An output, with links resolved, would replace such a file.
+        ValueError: An output, with links resolved, would replace such a file, or go into a run or its cache.
 
     >>> refuse_inputs([Path("answers.json")], instead="--output-json")
     """
@@ -124,7 +124,7 @@ def refuse_inputs(paths: Iterable[Path], *, instead: str = "path") -> None:
 
 
 def _owner_of(path: str, owners: Callable[[str], Iterable[Any]], inputs: Callable[[], Mapping[Any, str]]) -> str | None:
-    """Return a description of a path that is an input or part of an input, run, data set or cache; None for others.
+    """Return a description of a path that is an input or part of an input, run, data set or cache; None otherwise.
 
     Links in the path must already be resolved.
     """
@@ -162,8 +162,8 @@ def refuse_other_kinds(path: Path, kind: str | None, flags: str = "") -> None:
 
     Args:
         path: Path of the output. If it does not exist, the function returns without a check.
-        kind: Kind of the output, as `file_kind` returns it; None if it is not known yet.
-        flags: Flags that named the output, for the error message; empty if there are none.
+        kind: Kind of the output, as `file_kind` returns it; None if it is not known yet; kinds are then not compared.
+        flags: Flags for choosing the output, for the error message; empty if there are none.
     Raises:
         ValueError: `path` is a folder, a pipe, a device or a broken link, cannot be read, or is of a different kind.
     """
@@ -208,7 +208,7 @@ def file_kind(path: Path) -> str:
 
 
 def suffix_kind(path: Path) -> str | None:
-    """Return the kind of a file, which is the suffix of its path in lower case; None for an unknown suffix."""
+    """Return the kind of a file, which is the suffix of its path in lowercase; None for an unknown suffix."""
     return suffix if (suffix := path.suffix.lower()) in {*_KINDS, ".json", ".npz"} else None
 
 

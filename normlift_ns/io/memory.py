@@ -41,7 +41,7 @@ def free_memory(root: Path = Path("/")) -> dict[str, int]:
 
 
 def _cgroup_files(root: Path) -> Iterator[tuple[Path, Path]]:
-    """Yield the files with the limit and the usage of the cgroup of this process and of its parent groups.
+    """Yield the limit file and the usage file of the cgroup of this process and of each parent group.
 
     Both cgroup versions, 1 and 2, are supported.
     """
@@ -67,8 +67,8 @@ def check_free_memory(needed: int, what: str, needed_by_limit: Mapping[str, int]
 
     Args:
         needed: Number of bytes that the operation needs.
-        what: Name of the operation, for the error message.
-        needed_by_limit: Numbers of bytes that replace `needed` for some limits, by their names in `free_memory`.
+        what: Subject of the error message, such as "The lift".
+        needed_by_limit: Numbers of bytes that replace `needed` for some limits, by limit name as in `free_memory`.
     Raises:
         MemoryError: A limit leaves fewer bytes. The message gives both numbers.
     """

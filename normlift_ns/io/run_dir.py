@@ -31,7 +31,7 @@ TEXT_EMBEDDINGS_FILE = "texts.npz"
 _MAX_NAME_BYTES = 200
 """Maximum length of a folder name in bytes. Systems allow 255 bytes; the rest is reserved for appended numbers."""
 _SEAL = "# Lines below: "
-"""Beginning of a config.yml that normlift_ns wrote. After it comes the digest of all lines except the first."""
+"""Beginning of a config.yml that normlift_ns wrote. The digest of all lines except the first one follows."""
 _WRITTEN = (
     *("field.safetensors", "evidence.safetensors", TEXT_EMBEDDINGS_FILE, "../dataparser_transforms.json"),
     *("../splat.json", "../transforms.json", "../added_photographs.json"),
@@ -116,7 +116,7 @@ def recorded_gsplat_version(run_dir: Path) -> str | None:
 
 
 def resolve_manifest_paths(manifest: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
-    """Return a manifest in which a relative path of text embeddings is joined to `folder`, the manifest's folder."""
+    """Return a manifest in which the relative path of text embeddings is joined to `folder`, the manifest's folder."""
     encoder = manifest.get("encoder")
     if not isinstance(encoder, dict) or encoder.get("text_vectors") is None:
         return manifest
@@ -148,7 +148,7 @@ def check_run(run_dir: Path) -> None:
 
 
 def run_file_digests(folder: Path, files: Iterable[Path]) -> dict[str, str]:
-    """Return digests of files of a run, by path relative to the field folder.
+    """Return the digests of files of a run, by path relative to the field folder.
 
     Files that do not exist or are not part of the run are left out.
     """
@@ -227,10 +227,10 @@ class _Metadata(msgspec.Struct):
 def write_manifest(folder: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
     """Write a manifest of metadata, digests of files, and a digest of its own text.
 
-    The digest of the text is computed while its own value in the text is empty.
+    The digest of the text is computed with an empty string in its own place.
 
     Args:
-        facts: Metadata of JSON types.
+        facts: Metadata with JSON types.
         digests: Digests of files, by path relative to the folder.
     """
     content = {"digest": None, **facts} | {"digest": "", "digests": dict(digests)}  # `digest` is the first entry
@@ -314,7 +314,7 @@ def check_digests(folder: Path, actual: Mapping[str, str | None], expected: Mapp
 
 
 def _ends_as_archive(path: Path) -> bool:
-    """Return True if a file ends with the last record of a ZIP archive. Only the last 66 kB are read."""
+    """Return True if a file ends with the last record of a ZIP archive. At most the last 66 kB are read."""
     with open_regular(path) as file:
         return zipfile.is_zipfile(file)
 
