@@ -27,7 +27,7 @@ _FIELD_OF_VIEW = 75.0
 
 
 def demo_cameras(count: int = 24, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
-    """Return cameras on a circle inside the room, at three alternating heights, that point across the table.
+    """Return cameras on a circle inside the room, at three alternating heights, that point at the table.
 
     Sizes are in pixels.
     """
@@ -107,7 +107,7 @@ def _look_at(
     """Return a camera that points at a target.
 
     Args:
-        position: Distance from the center of the room in meters, azimuth in degrees, and height in meters.
+        position: Horizontal distance from the center of the room in meters, azimuth in degrees, and height in meters.
         target: Position (x, y, z) in meters.
         width: Width of the image in pixels.
         height: Height of the image in pixels.

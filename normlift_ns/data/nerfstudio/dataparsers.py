@@ -59,7 +59,7 @@ def normalize_poses(
 def compose_applied_transform(
     transform: Float[Tensor, "3 4"], applied: Sequence[Sequence[float]] | None
 ) -> Float[Tensor, "3 4"]:
-    """Return the map that applies first `applied` and then `transform`, from the original world of the capture.
+    """Return the map from the original world of the capture that applies first `applied` and then `transform`.
 
     `applied` is the transform that was applied to the poses before they were stored, or None if there was none.
     """
