@@ -303,8 +303,8 @@ class ImageViews(SplitViews):
     Images of perspective cameras are undistorted as in nerfstudio's FullImageDatamanager, so nerfstudio's commands use
     the same images. The camera matrix becomes OpenCV's optimal one without black borders, and images are cropped to its
     region of interest. Images of fisheye cameras keep their size, and at least 90 % of their pixels if a pinhole camera
-    can show these (see `fisheye_pinhole`). Their masks are undistorted without interpolation, and are False at pixels
-    that the original image does not show.
+    can show that many (see `fisheye_pinhole`). Their masks are undistorted without interpolation, and are False at
+    pixels that the original image does not show.
 
     Args:
         frames: Image files and their cameras.

@@ -317,7 +317,7 @@ class StoredRun(NamedTuple):
 
 
 def open_stored_run(load_config: str | Path, data: str | Path | None = None) -> StoredRun:
-    """Open the scene and the field of a lifted run, and warn about unusual images and changed cameras.
+    """Open the scene and the field of a lifted run, and issue warnings about the scene and about changed cameras.
 
     Args:
         load_config: Path of the config.yml of the run.

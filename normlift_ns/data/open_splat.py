@@ -303,7 +303,7 @@ def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> Splat
 
 
 def _format(path: Path) -> str:
-    """Detect the format of a file, and return the key of `SPLAT_READERS`.
+    """Detect the format of a file, and return its key in `SPLAT_READERS`.
 
     The suffix decides for formats of other packages. For all other files, the first bytes decide, or else the suffix.
 
@@ -339,7 +339,7 @@ def _format(path: Path) -> str:
 
 
 def _refuse_archive(path: Path) -> None:
-    """Raise InputError unless torch.save wrote a ZIP archive, or it is too damaged to list its contents."""
+    """Raise InputError unless a ZIP archive was written by torch.save, or is too damaged to be listed."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()

@@ -174,7 +174,7 @@ class SplatFile(NamedTuple):
     remarks: tuple[str, ...] = ()
     """Messages about the file, such as rounding errors of a compressed format."""
     primitive: Primitive | None = None
-    """Kind of the Gaussians; None if unknown."""
+    """Primitive of the training, 3D or 2D Gaussians; None if unknown."""
     clip_planes: tuple[float, float] | None = None
     """Near and far planes of the training in world units; None if unknown, or the same as in splatfacto."""
 

@@ -29,7 +29,7 @@ SPZ_MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
 """Magic number, version, number of Gaussians, SH degree, fractional bits of the positions, flags, number of streams."""
 _TABLE_OFFSET, _TABLE_ENTRY = struct.Struct("<16xI12x"), struct.Struct("<QQ")
-"""Header of version 4 with the offset of the table, and table entry with the compressed and uncompressed size."""
+"""Header of version 4 with the offset of the table, and table entry with the compressed and uncompressed sizes."""
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 """Bits of the flags in a header: antialiased Gaussians, and extensions in the file."""
 _MAX_FRACTIONAL_BITS, _MAX_FIXED = 23, 2**23 - 1
@@ -63,15 +63,16 @@ def encode_spz(
     """Encode Gaussians as an SPZ file, in the order of their rows and in their own coordinates.
 
     Positions are rounded to multiples of a power of two, the smallest from 2^-23 to 1 for which all fit into 24 bits.
-    Logarithms of scales are rounded to 1/16, and clamped to -10..5.94. Opacities are rounded to 1/255. Constant
-    spherical harmonics are rounded to 1/38 and clamped to -3.33..3.33, others to 1/16 (degree 1) or 1/8 and -1..1.
-    Rotations change by at most 0.005 radians. Gaussians that are never drawn get opacity 0.
+    Logarithms of scales are rounded in steps of 1/16 and clamped to -10..5.94. Opacities are rounded in steps of 1/255.
+    Constant spherical harmonics are rounded in steps of 1/38 and clamped to -3.33..3.33. Other harmonics are rounded in
+    steps of 1/16 (degree 1) or 1/8 and clamped to -1..1. Rotations change by at most 0.005 radians. Gaussians that are
+    never drawn get opacity 0.
 
     Args:
         splat: Gaussians to encode.
         antialiased: True if they were trained with the rasterize mode "antialiased".
         version: Version of the format. More programs read version 3 than version 4.
-        position_step: Round positions to larger steps of up to this length, which makes the file smaller.
+        position_step: Maximum step of a coarser rounding of positions, for a smaller file; 0 for no coarser rounding.
     Raises:
         ValueError: A Gaussian that can be drawn is farther than 8,388,607 from the origin along an axis.
     """

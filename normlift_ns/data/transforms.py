@@ -461,7 +461,7 @@ def _distortion(
     """Return the distortion parameters k1, k2, k3, p1, p2 and k4.
 
     Raises:
-        ValueError: A parameter that the camera type does not have is not zero. Such parameters are k4 of perspective
+        ValueError: A parameter that the camera type does not have is nonzero. Such parameters are k4 of perspective
             cameras, p1 and p2 of fisheye cameras, and k5 and k6.
     """
     values = [getattr(entry, name) or 0.0 for name in DISTORTION]
@@ -657,9 +657,9 @@ def gsplat_normalization(frames: Sequence[Frame], points: Float[np.ndarray, "n 3
         frames: All registered images, sorted by name.
         points: Points of the reconstruction, at least four.
     Returns:
-        The similarity of the trainer. The similarity of the actual training may differ by half a turn about an axis.
-        The reason is that the signs of the axes depend on the linear algebra library. Versions of gsplat before 1.5 do
-        not flip the points.
+        The similarity that the trainer computes. That of the actual training may differ by half a turn about an axis,
+        because the signs of the axes depend on the linear algebra library. Versions of gsplat before 1.5 do not turn
+        the scene upside down.
     Raises:
         ValueError: The normalization cannot be computed, or the trainer's formula mirrors the world.
     """

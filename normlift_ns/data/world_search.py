@@ -175,7 +175,7 @@ class _Search:
         return small._replace(view=small.view._replace(camera=camera)).render(self._scene, self._gaussians, settings)
 
     def _refine(self, candidate: CandidateWorld, log: float) -> float | None:
-        """Return the logarithm of the scale that fits best, near a first guess; None if a render does not fit an image.
+        """Return the logarithm of the scale that fits best, from the guess `log`; None if its render does not fit.
 
         Points refine the guess to a few percent. Parabolas through the mean squared errors of renders of one view then
         refine it further.

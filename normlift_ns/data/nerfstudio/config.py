@@ -120,7 +120,7 @@ class ConfigPaths:
 
     experiment: str | None
     output_dir: Path | None
-    """Folder that contains the experiment folder."""
+    """Folder of the experiments, as in `RunLocation`."""
     data: tuple[Path, ...]
     """Possible paths of the dataset; empty if they are unknown."""
 
@@ -171,7 +171,7 @@ class RunLocation:
 
 
 def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunLocation:
-    """Locate the files of a run from the path of its config.yml, independent of the current directory.
+    """Locate the files of a run from the path of its config.yml.
 
     Paths in a config.yml are relative to the working directory of the training, which the file does not contain. The
     function infers this directory from the path output_dir/experiment/method/timestamp/config.yml.
@@ -417,7 +417,7 @@ _REMEDY = "Restore the original config.yml of the run."
 _TRAINING_ONLY = re.compile(
     r"(machine|logging|viewer)\..*|pipeline\.datamanager\.(cache_images|cache_images_type|train_cameras_sampling_strategy)"
 )
-"""Names of fields that affect neither rendering nor the choice of the lifted images."""
+"""Pattern for the names of fields that affect neither rendering nor the choice of the lifted images."""
 _DRAWN = re.compile(
     r"2d|3dgut|unscented|kernel|filter|near_plane|far_plane|radius_clip|eps2d|camera_model|raster|render|modifier|"
     r"activation|antialias|appearance|embed|deform|motion|exposure|blur|distort"

@@ -33,8 +33,8 @@ def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class
 
     Args:
         module: Module of the mirrored class.
-        target: Name of the `_target` of the mirrored class, which may include its module (default: `module`). None for
-            no target.
+        target: Name of the `_target` of the mirrored class, with its module unless that is `module`; None for no
+            target.
     """
 
     def register(cls: _Class) -> _Class:

@@ -145,7 +145,7 @@ class NerfstudioScene:
     identity: Mapping[str, Any]
     """Path of the config and step of the checkpoint for the manifest; for lifted runs, also the version of gsplat."""
     remarks: tuple[str, ...] = ()
-    """Warnings about the images, in whole sentences."""
+    """Warnings about the config, the cameras and the images, in whole sentences."""
     extra_frames: tuple[Frame, ...] = ()
     """Frames of the extra views at the end of `train`, in the world of the Gaussians.
 
