@@ -93,14 +93,14 @@ class Surface(NamedTuple):
 
 
 SurfaceColors = Callable[[Sequence[Part], Surface, np.random.Generator], Array]
-"""Function that returns the sRGB colors [n, 3] of surface Gaussians with light and shadow. Values can be outside
+"""Function that returns the sRGB colors [n, 3] of surface Gaussians, including light and shadow. Values can be outside
 0..1."""
 
 
 class _Gaussians(NamedTuple):
     means: Array
     normals: Array
-    """Unit vectors [n, 3] along the axes of the third column of `scales`."""
+    """Unit vectors [n, 3] along the axis of the third scale."""
     scales: Array
     opacities: Array
     colors: Array

@@ -91,7 +91,7 @@ def union(*shapes: Distance) -> Distance:
 
 
 def row_lengths(vectors: Array) -> Array:
-    """Return the lengths [n] of rows [n, k], much faster than numpy.linalg.norm for short rows."""
+    """Return the lengths [n] of rows [n, k]. For short rows, this is much faster than numpy.linalg.norm."""
     return np.sqrt(np.einsum("nk,nk->n", vectors, vectors))
 
 
@@ -322,7 +322,7 @@ def bowl(radius: float, thickness: float) -> Distance:
 
 
 def heap(centers: Array, radius: float) -> Distance:
-    """Return the union of spheres of equal radius."""
+    """Return the union of spheres of equal radius around the centers."""
     tree = KDTree(centers)
     return lambda p: np.asarray(tree.query(p)[0]) - radius
 
