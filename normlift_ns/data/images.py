@@ -1,4 +1,4 @@
-"""Training images, their undistortion to pinhole cameras, and the selection of held-out images."""
+"""Views of image files, their undistortion to pinhole cameras, and the selection of held-out images."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def held_out_names(names: Sequence[str], *, test_every: int | None, eval_images:
 
     Args:
         names: Sorted names of all images.
-        test_every: Interval n of held-out images, starting with the first image, as in gsplat's trainer and in Inria's
-            trainer with --eval.
+        test_every: Interval of the held-out images, starting with the first image, as in gsplat's trainer and in
+            Inria's trainer with --eval.
         eval_images: Image names with or without folder and suffix, a text file with one name per line, or the fraction
             of held-out images. For a fraction, the training images are evenly spaced, as in ns-train's data parser.
     Raises:
-        ValueError: A name matches no image or several images, a value is invalid, or both options are given.
+        ValueError: A name matches no image or several images, a value is invalid, or both arguments are given.
     """
     if test_every is not None and len(eval_images) > 0:
         raise InputError("--test-every and --eval-images cannot be combined; omit one of them")
@@ -105,7 +105,7 @@ def _matching(requested: str, names: Sequence[str]) -> list[str]:
 def to_camera(
     camera_to_world: Float[Tensor, "3 4"], intrinsics: Float[Tensor, "3 3"], width: int, height: int
 ) -> Camera:
-    """Convert an OpenGL pose (x right, y up, z backward) to an OpenCV camera, with the same steps as splatfacto."""
+    """Convert an OpenGL pose (x right, y up, z backward) and intrinsics to an OpenCV camera, as splatfacto does."""
     rotation = (camera_to_world[:, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])).T
     pose = torch.eye(4, dtype=camera_to_world.dtype, device=camera_to_world.device)
     pose[:3, :3] = rotation
@@ -114,7 +114,7 @@ def to_camera(
 
 
 def blend_background(image: UInt8[Tensor, "h w c"], background: Float[Tensor, " 3"]) -> UInt8[Tensor, "h w 3"]:
-    """Blend a background color, RGB in 0..1, behind an image with an alpha channel; return other images unchanged."""
+    """Blend an image with an alpha channel over a background color, RGB in 0..1; return other images unchanged."""
     if image.shape[2] != 4:
         return image
     alpha = image[:, :, 3:].float() / 255
@@ -131,7 +131,7 @@ def _scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
 
 @contextmanager
 def open_scaled(file: Path, scale: float, resampling: Image.Resampling) -> Iterator[Image.Image]:
-    """Yield an image file opened by Pillow, resized by a factor (nerfstudio's camera_res_scale_factor)."""
+    """Open an image file with Pillow, and yield the image resized by `scale`, nerfstudio's camera_res_scale_factor."""
     with open_regular(file) as stream, Image.open(stream) as opened:
         yield opened if scale == 1 else opened.resize(_scaled_size(opened.size, scale), resampling)
 
@@ -148,10 +148,10 @@ class SplitViews:
         files: Paths of the images.
         names: Paths of the images relative to the dataset.
         masks: One path per image, with None for an image without a mask; None if no image has a mask.
-        sizes: Width and height of the cameras in pixels, before undistortion.
+        sizes: Width and height of each camera in pixels, before undistortion.
         poses: Camera-to-world poses [V, 3, 4] in OpenGL convention, from the dataset or optimized by the training.
-        background: RGB in 0..1, blended behind images with an alpha channel.
-        scale: Factor that resizes the files, nerfstudio's camera_res_scale_factor.
+        background: Color behind images with an alpha channel, RGB in 0..1.
+        scale: Resize factor of images and masks, nerfstudio's camera_res_scale_factor.
     """
 
     _LISTED_IN, _TRAINED = "the dataset", "run"
@@ -176,7 +176,7 @@ class SplitViews:
         protect_inputs(*self.files, *self._masks)
 
     def _pixels(self, file: Path) -> UInt8[np.ndarray, "h w c"]:
-        """Read an image at the size of the camera. Subclasses must override this method or `_load`."""
+        """Read an image at the size of its camera. Subclasses must override this method or `_load`."""
         raise NotImplementedError
 
     def _lens(self, index: int) -> Intrinsics:
@@ -184,7 +184,7 @@ class SplitViews:
         raise NotImplementedError
 
     def _load(self, index: int) -> tuple[Any, Any]:
-        """Read an image [H, W, C] and its mask, or None without a mask, at the size of the camera."""
+        """Read an image [H, W, C] and its mask (None if there is no mask), at the size of the camera."""
         image, file = self._pixels(self.files[index]), self._masks[index]
         if file is None:
             return image, None
@@ -298,22 +298,22 @@ class SplitViews:
 
 
 class ImageViews(SplitViews):
-    """Lazy `Views` of the images in a camera file; each access reads and undistorts one image.
+    """Lazy `Views` of the images that a camera file lists; each access reads and undistorts one image.
 
     Images of perspective cameras are undistorted as in nerfstudio's FullImageDatamanager, so nerfstudio's commands use
     the same images. The camera matrix becomes OpenCV's optimal one without black borders, and images are cropped to its
     region of interest. Images of fisheye cameras keep their size, and at least 90 % of their pixels if a pinhole camera
-    can show these (see `fisheye_pinhole`). Their masks are undistorted without interpolation, and are False at pixels
-    that the original image does not show.
+    can show that many (see `fisheye_pinhole`). Their masks are undistorted without interpolation, and are False at
+    pixels that the original image does not show.
 
     Args:
         frames: Image files and their cameras.
-        background: RGB in 0..1, blended behind images with an alpha channel.
+        background: Color behind images with an alpha channel, RGB in 0..1.
     """
 
     _LISTED_IN, _TRAINED = "the camera file", "splat"
     frames: list[Frame]
-    """Frames as read from the camera file."""
+    """Cameras of the images before undistortion, and paths of the images and masks."""
 
     def __init__(self, frames: Sequence[Frame], background: Float[Tensor, " 3"]) -> None:
         self.frames = list(frames)
@@ -365,7 +365,7 @@ def _mode_problem(mode: str) -> str | None:
 
 @lru_cache  # the images of a camera share their intrinsics
 def _undistorted_intrinsics(lens: Intrinsics) -> tuple[Float[Tensor, "3 3"], int, int]:
-    """Return the camera matrix, width and height of undistorted images."""
+    """Return the camera matrix, width and height of the undistorted images of a camera."""
     if not lens.is_distorted:
         return torch.from_numpy(_matrix(lens)), lens.width, lens.height
     image, matrix = undistort_image(np.zeros((lens.height, lens.width, 1), np.uint8), lens)
@@ -398,7 +398,10 @@ def undistort_image(
 
 
 def _undistorted(image: Any, lens: Intrinsics) -> tuple[Any, Any, tuple[int, int]]:
-    """Return an undistorted image, its camera matrix before cropping, and the corner (x, y) of the crop."""
+    """Return an undistorted perspective image, its camera matrix before cropping, and the corner (x, y) of the crop.
+
+    In this matrix, pixel centers are at integers.
+    """
     if lens.k4 != 0:
         raise InputError("k4 is not 0; only k1, k2, k3, p1 and p2 are supported")
     k1, k2, k3, p1, p2 = (float(np.float32(value)) for value in lens.distortion)

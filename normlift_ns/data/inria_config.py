@@ -16,7 +16,7 @@ TEST_EVERY = 8
 
 
 class InriaConfig(NamedTuple):
-    """Settings in a cfg_args that affect rendering or the choice of training images."""
+    """Settings in a cfg_args file that affect rendering or the choice of training images."""
 
     path: Path
     white_background: bool
@@ -25,10 +25,10 @@ class InriaConfig(NamedTuple):
 
 
 def find_inria_config(splat: Path) -> InriaConfig | None:
-    """Read the cfg_args of the training run that contains a PLY file.
+    """Read the cfg_args of the training run that contains a splat file.
 
     Returns:
-        The settings, or None without a cfg_args of Inria's trainer. Missing settings have the trainer's defaults.
+        The settings, or None if there is no cfg_args of Inria's trainer. Missing settings have the trainer's defaults.
     Raises:
         ValueError: The file is damaged.
     """

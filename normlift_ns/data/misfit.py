@@ -1,4 +1,4 @@
-"""Causes of a poor alignment: a different focal length, principal point, distortion or primitive fits the images."""
+"""Search for the cause of a poor alignment: a wrong focal length, principal point, distortion or primitive."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from torch.nn import functional
 from normlift_ns.data.reduced_views import ReducedView
 
 _SIDES = (50, 100, 200)
-"""Longer sides of the images in pixels, from the coarsest search to the finest."""
+"""Lengths of the longer image side in pixels, from the coarsest search to the finest."""
 _HALVINGS, _MAX_MOVES = 2, 8
 """Number of halvings of the step for each image size, and maximum number of moves for each step."""
 _MIN_GAIN = 1.0
-"""Minimum gain in dB of a better lens. On a sharp scene, an error of 2 % in the focal length costs about 15 dB. A gain
-of 1 dB is therefore not due to chance."""
+"""Minimum gain in PSNR, in dB, of a change that is reported as the cause. On a sharp scene, an error of 2 % in the
+focal length costs about 15 dB."""
 _MIN_OVERLAP = 0.25
-"""Minimum share of the pixels that can still be compared after a change of the lens."""
+"""Minimum share of the unmasked pixels that can still be compared after a change of the lens."""
 
 
 class Lens(NamedTuple):
@@ -32,11 +32,11 @@ class Lens(NamedTuple):
     focal: float = 1.0
     """Factor on the focal lengths."""
     x: float = 0.0
-    """Shift of the principal point to the right, in widths of the image."""
+    """Shift of the principal point to the right, in image widths."""
     y: float = 0.0
-    """Shift of the principal point downward, in widths of the image."""
+    """Shift of the principal point downward, in image widths."""
     k1: float = 0.0
-    """Increase of the radial distortion k1 of OpenCV."""
+    """Increase of OpenCV's radial distortion parameter k1."""
 
 
 _PROBES = (
@@ -49,19 +49,19 @@ _PROBES = (
 
 
 class _Pair(NamedTuple):
-    """An image and a render of the same size. Both are blurred, because interpolation for a lens blurs the image."""
+    """Blurred image and render of the same size. Without the blur, warping would make only the image less sharp."""
 
     image: Float[Tensor, "1 4 h w"]
-    """RGB in 0..1, and the unmasked fraction of the pixel's blur window."""
+    """RGB in 0..1, and the fraction of unmasked pixels in each pixel's blur window."""
     render: Float[Tensor, "1 3 h w"]
     focal: tuple[float, float]
     center: tuple[float, float]
 
     def compare(self, lens: Lens) -> tuple[float, float]:
-        """Compare the image as another lens shows it with the render and with its own mean color.
+        """Warp the image by a change of the lens, and compare it with the render and with its own mean color.
 
         Returns:
-            The PSNR in dB of the render and that of the mean color, or -inf and 0 if the overlap is too small.
+            The PSNR in dB of the render and the PSNR of the mean color, or -inf and 0 if the overlap is too small.
         """
         height, width = self.image.shape[2:]
         (fx, fy), (cx, cy) = self.focal, self.center
@@ -103,7 +103,7 @@ def explain_misfit(
     min_psnr: float,
     min_margin: float,
 ) -> str | None:
-    """Return a sentence about a change that makes the renders fit the images; None if no change does.
+    """Return a message about the change with which the renders fit the images best; None if no change fits well enough.
 
     Changes of the lens are tried by warping the images, without new renders.
 
@@ -144,7 +144,7 @@ def _blurred(image: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c h w"]:
 
 
 def _whole(mask: Bool[Tensor, "h w"]) -> Float[Tensor, "1 1 h w"]:
-    """Return the unmasked fraction of each pixel's blur window, 1 without masked pixels."""
+    """Return the fraction of unmasked pixels in each pixel's blur window."""
     return _blurred(mask[None, None].float())
 
 
@@ -177,7 +177,7 @@ _FLAT = (
 
 
 def _describe(lens: Lens, views: Sequence[ReducedView]) -> str:
-    """Return a sentence about a lens, with {gain} for its gain."""
+    """Return a message about a change of the lens, with the placeholder {gain} for the gain in PSNR."""
     if lens.focal != 1.0:
         side = "longer" if lens.focal > 1 else "shorter"
         return (

@@ -1,4 +1,4 @@
-"""Functions that open splatfacto runs and lifted runs, with the splat or the extra images stored in a lifted run."""
+"""Functions that open splatfacto runs and lifted runs, including a splat or extra images stored in a lifted run."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ class SplatScene:
     remarks: tuple[str, ...] = ()
     """Warnings about the images, in whole sentences."""
     alignment: Alignment | None = None
-    """Agreement of renders by the rules of gsplat 1.4 with the images; None unless the search for the world found a
-    world that fits."""
+    """Agreement between the images and renders by the rules of gsplat 1.4; None unless the search for the world found
+    a world that fits."""
 
     renderer = None
     """Renderer of another package; None, because `normlift_ns` renders this scene."""
@@ -78,7 +78,7 @@ class SplatScene:
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """Raw parameters of the training, by splatfacto's names."""
+        """Raw parameters of the Gaussians, by splatfacto's names."""
         return self.splat.parameters
 
     @property
@@ -125,7 +125,7 @@ class _Saved(msgspec.Struct):
 
 
 def save_splat(folder: Path, scene: SplatScene) -> None:
-    """Write splat.json, and transforms.json with the cameras, into the folder of a run."""
+    """Write the settings of a splat to splat.json, and its cameras to transforms.json, in the folder of a run."""
     write_transforms(folder / TRANSFORMS_FILE, scene.train.frames, scene.held_out.frames)
     saved = _Saved(scene.name, scene.rasterize_mode, scene.background_name, str(scene.names_root), dict(scene.identity))
     write_text_file(folder / SPLAT_FILE, json.dumps(msgspec.to_builtins(saved), indent=2) + "\n")
@@ -195,12 +195,12 @@ def open_saved_splat(run_dir: Path, *, data: Path | None = None, load_step: int 
 
 
 EXTRA_IMAGES_FILE = "added_photographs.json"
-"""Name of the file in a lifted nerfstudio run with the cameras of extra images, in the world of the Gaussians."""
+"""Name of the file in a lifted nerfstudio run that contains the cameras of extra images, in the Gaussians' world."""
 AnyScene = TypeVar("AnyScene", NerfstudioScene, SplatScene)
 
 
 class _ConcatenatedViews:
-    """Concatenated `Views` of two datasets."""
+    """Concatenation of two `Views`."""
 
     def __init__(self, first: Views, second: Views) -> None:
         self._first, self._second = first, second
@@ -235,7 +235,7 @@ def with_frames(scene: AnyScene, frames: Sequence[Frame]) -> AnyScene:
 
 
 def add_stored_images(scene: NerfstudioScene, run_dir: Path) -> NerfstudioScene:
-    """Return the scene of a lifted run, with the extra images that are stored in the run.
+    """Return the scene with the extra images that a lifted run stores, if any.
 
     Raises:
         FileNotFoundError, ValueError: A file is missing or damaged. The message gives its path.
@@ -317,14 +317,14 @@ class StoredRun(NamedTuple):
 
 
 def open_stored_run(load_config: str | Path, data: str | Path | None = None) -> StoredRun:
-    """Open the scene and the field of a lifted run, and warn about unusual images and changed cameras.
+    """Open the scene and the field of a lifted run, and issue warnings about the scene and about changed cameras.
 
     Args:
         load_config: Path of the config.yml of the run.
         data: Current path of the dataset, if it was moved.
     Raises:
-        FileNotFoundError, ValueError: As in `open_scene` and `check_run`; also if the run has no semantic field, or a
-            field of other Gaussians.
+        FileNotFoundError, ValueError: As in `open_scene` and `check_run`; also if the run has no semantic field, or
+            the field belongs to other Gaussians.
     """
     folder = Path(os.path.abspath(check_path("load_config", load_config))).parent
     check_run(folder)

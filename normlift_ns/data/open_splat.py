@@ -33,7 +33,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 from normlift_ns.registry import Registry
 
 _MAX_STEP = 0.1
-"""Maximum step between neighboring float32 coordinates, as a fraction of the width of the median Gaussian."""
+"""Maximum step between neighboring float32 coordinates, as a fraction of the median width of the Gaussians."""
 
 
 @check_arguments
@@ -48,10 +48,10 @@ def open_splat(
 
     Args:
         path: A plain or compressed PLY file, an SPZ, .splat, GLB or glTF file, or ckpt_<step>_rank<r>.pt of gsplat's
-            simple_trainer. First bytes or suffix determine the format. Installed packages may add formats by suffix.
+            simple_trainer. The first bytes or the suffix determine the format. Installed packages may add formats.
         options: Paths of the cameras and images, and settings of the splat.
-        device: Device of the renders that find the world: auto, cpu, cuda, or one GPU such as cuda:1.
-        say: Function that is called with a message for each assumption, for example `print`.
+        device: Device for the renders that find the world: auto, cpu, cuda, or one GPU such as cuda:1.
+        say: Function that is called with a message about each assumption, for example `print`.
     Raises:
         FileNotFoundError: A file or image is missing.
         ValueError: A file cannot be read, does not match the others, or is not a splat. Also if `path` is not a path.
@@ -163,7 +163,7 @@ def _check_coordinates(
 
 
 def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None) -> frozenset[str]:
-    """Return the names of the held-out images according to the options, or else to the trainer or the camera file."""
+    """Return the names of the held-out images: from the options, else the training settings, else the camera file."""
     held_out, frames = cameras.held_out, cameras.frames
     if options.test_every is not None or len(options.eval_images) > 0:
         test_every = options.test_every
@@ -178,7 +178,7 @@ def _held_out(options: SplatOptions, cameras: CameraFile, test_every: int | None
 _HEAD_BYTES = 64
 _MAGIC = {b"ply": "ply", SPZ_MAGIC: "spz", GZIP_MAGIC: "spz", GLB_MAGIC: "glb"}
 _SNIFFED = {*_MAGIC.values(), "pt", "splat", "gltf"}
-"""Built-in formats. The first bytes of a file decide between them, and its suffix only if the bytes match none."""
+"""Built-in formats, detected by the first bytes of a file, or by its suffix if the bytes match none of them."""
 _UNREAD = ("sog", "ksplat", "lcc", "usdz", "usd", "usda", "usdc")
 """Suffixes of unsupported formats."""
 _JSON_FORMATS = {"meta.json": "SOG", "lod-meta.json": "streamed SOG"}
@@ -190,7 +190,7 @@ _STRANGERS = {
     b"<!doctype html": ("an HTML page", _DOWNLOAD),
     b"<html": ("an HTML page", _DOWNLOAD),
 }
-"""First bytes of files that a failed download leaves instead of a splat, with their kind and advice."""
+"""First bytes, in lower case, of files that a failed download leaves instead of a splat, with their kind and advice."""
 SPLAT_READERS = Registry(
     "normlift_ns.scenes",
     {
@@ -257,7 +257,7 @@ def _with_gsplat_config(file: SplatFile, path: Path) -> SplatFile:
 
 
 def _with_inria_config(file: SplatFile, path: Path, options: SplatOptions) -> tuple[SplatFile, Background]:
-    """Add the settings in the cfg_args of the training run to the contents of a file; also return the background."""
+    """Return the contents of a file with the settings in the cfg_args of the training run, and the background color."""
     config = find_inria_config(path)
     if config is None:
         return file, options.background or "black"
@@ -269,11 +269,11 @@ def _with_inria_config(file: SplatFile, path: Path, options: SplatOptions) -> tu
 
 
 _CLIP_PLANES = (0.2, 1e10)
-"""Near and far planes of the 2DGS trainers of gsplat and Inria, in world units, if no file contains them."""
+"""Near and far planes for 2D Gaussians in world units, if no file contains them. 2DGS trainers use this near plane."""
 
 
 def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> SplatFile:
-    """Return the file with a known primitive, from the options, the files or the file name, in this order.
+    """Set the primitive of a splat from the options, its files or its file name, in this order; flatten 2D Gaussians.
 
     Raises:
         ValueError: The options and the files contradict each other.
@@ -303,7 +303,7 @@ def _with_primitive(file: SplatFile, path: Path, options: SplatOptions) -> Splat
 
 
 def _format(path: Path) -> str:
-    """Detect the format of a file, and return the key of `SPLAT_READERS`.
+    """Detect the format of a file, and return its key in `SPLAT_READERS`.
 
     The suffix decides for formats of other packages. For all other files, the first bytes decide, or else the suffix.
 
@@ -339,7 +339,7 @@ def _format(path: Path) -> str:
 
 
 def _refuse_archive(path: Path) -> None:
-    """Raise InputError unless a ZIP archive is a file of torch.save, or too damaged to list its content."""
+    """Raise InputError unless a ZIP archive was written by torch.save, or is too damaged to be listed."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()

@@ -20,22 +20,22 @@ _MAX_SIDE = 400
 _MAX_DIVISOR_AS_TRAINED = 4.0
 """Limit on the divisor of the image size for renders in the trained mode.
 
-Below the limit, a render uses the trained mode, and the rasterizer's blur of 0.3 square pixels is scaled down. Other
-renders are antialiased, so that the blur does not add opacity to Gaussians smaller than a pixel.
+Below the limit, 3D Gaussians are rendered in the trained mode, and the rasterizer's blur of 0.3 square pixels is scaled
+down. Other reduced renders are antialiased, so that the blur does not add opacity to Gaussians smaller than a pixel.
 """
 _SMALL_EPS2D = 0.1
-"""Variance in square pixels that the antialiased renders add to projected Gaussians."""
+"""Variance in square pixels that these antialiased renders add to projected Gaussians."""
 
 
 class ReducedView(NamedTuple):
-    """A view that may be smaller than its image."""
+    """View whose image may be downscaled."""
 
     view: View
     divisor: float
-    """Divisor of the sides of the image, at least 1."""
+    """Divisor of the sides of the original image, at least 1."""
 
     def reduced(self, side: int) -> ReducedView:
-        """Return the view with at most `side` pixels on the longer side, by averaging pixels."""
+        """Downscale the view to at most `side` pixels on the longer side, by averaging pixels."""
         camera = self.view.camera
         divisor = max(1.0, max(camera.width, camera.height) / side)
         width, height = max(1, int(camera.width / divisor)), max(1, int(camera.height / divisor))
@@ -52,7 +52,7 @@ class ReducedView(NamedTuple):
         return float(-10 * difference.square().mean().clamp(min=1e-9).log10()) if difference.numel() > 0 else 0.0
 
     def mean_color(self) -> UInt8[Tensor, "h w 3"]:
-        """Return a constant image in the mean color of the image."""
+        """Return an image of one color, the mean over the pixels that the mask keeps."""
         view = self.view
         pixels = view.image.float() if view.mask is None else view.image[view.mask].float()
         color = pixels.reshape(-1, 3).mean(dim=0).nan_to_num()
@@ -64,7 +64,7 @@ class ReducedView(NamedTuple):
         Args:
             scene: Scene to render.
             gaussians: Gaussians of the scene, on the rendering device.
-            settings: Constants of the rasterizer at full size.
+            settings: Rasterizer settings for a render at full size.
         """
         as_trained = self.divisor < _MAX_DIVISOR_AS_TRAINED
         if gaussians.primitive == "2dgs" and self.divisor > 1:  # as thin 3D Gaussians, whose blur can be reduced

@@ -1,4 +1,4 @@
-"""Parameters of a trained splat, their validation, and the reader for PLY files."""
+"""Parameters of a trained splat, their validation and transformation, and the reader for PLY files."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from normlift_ns.rasterization.rasterize import rotate_harmonics
 SH_DEGREES = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
 """Degree of the spherical harmonics, by the number of coefficients without the constant one."""
 _MAX_MEDIAN_WIDTH = 0.02
-"""Largest plausible width of the median Gaussian, as a fraction of the extent of the scene.
+"""Largest plausible median width of the Gaussians, as a fraction of the extent of the scene.
 
-If the median is wider and no log scale is negative, the file probably contains linear scales.
+If the median is larger and no log scale is negative, the file probably contains linear scales.
 """
 
 _COLUMNS = {
@@ -59,9 +59,9 @@ class SplatParameters:
     opacities: Float[Tensor, "n 1"]
     """Logits of the opacities."""
     features_dc: Float[Tensor, "n 3"]
-    """Constant spherical harmonic of the colors."""
+    """Coefficients of the constant spherical harmonic of the colors."""
     features_rest: Float[Tensor, "n k 3"]
-    """Other spherical harmonics of the colors, with K = 0, 3, 8, 15 or 24."""
+    """Coefficients of the other spherical harmonics, with K = 0, 3, 8, 15 or 24."""
 
     def __len__(self) -> int:
         return len(self.means)
@@ -168,20 +168,19 @@ class SplatFile(NamedTuple):
     pose_adjust: Float[Tensor, "v 9"] | None = None
     """Pose adjustments of the training views by gsplat's --pose_opt: 3 numbers for translation, 6 for rotation."""
     by_gsplat: bool = False
-    """True if gsplat's simple_trainer wrote the file, and its cfg.yml does not rule out that it normalized the world of
-    the cameras."""
+    """True if gsplat's simple_trainer wrote the file, and may have normalized the world of the cameras."""
     test_every: int | None = None
     """Interval n if the training held out every n-th image; None if unknown."""
     remarks: tuple[str, ...] = ()
     """Messages about the file, such as rounding errors of a compressed format."""
     primitive: Primitive | None = None
-    """Kind of the Gaussians; None if unknown."""
+    """Primitive of the training, 3D or 2D Gaussians; None if unknown."""
     clip_planes: tuple[float, float] | None = None
     """Near and far planes of the training in world units; None if unknown, or the same as in splatfacto."""
 
 
 _FLATNESS = math.log(1e-3)
-"""Logarithm of the thickness of a 2D Gaussian, as a fraction of its smaller standard deviation."""
+"""Logarithm of the ratio of the thickness of a 2D Gaussian to its smaller standard deviation."""
 
 
 def flatten_splat(splat: SplatParameters) -> SplatParameters:
@@ -235,8 +234,8 @@ def read_ply(path: Path) -> SplatFile:
     """Read a splat from a PLY file, which may be compressed.
 
     Properties may be in any order. Unknown properties are ignored, except those of other primitives. The property
-    filter_3D is applied to scales and opacities, as in Mip-Splatting. Peak memory is slightly more than one copy of the
-    Gaussians.
+    filter_3D is applied to scales and opacities, as in Mip-Splatting. For a plain file without filter_3D, peak memory
+    is slightly more than one copy of the Gaussians.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -299,7 +298,7 @@ def _apply_filter(splat: SplatParameters, widths: Float[Tensor, " n"], path: Pat
 
 
 class _PlainHeader(io.FileIO):
-    """PLY file with a header of the same length that plyfile can read.
+    """PLY file that is read with a changed header of the same length, so that plyfile can parse it.
 
     Bytes outside ASCII become question marks. Lines of obj_info, which some programs write after the properties, become
     comments.
@@ -407,7 +406,7 @@ def _advice(missing: list[str]) -> str:
 
 
 def _rest_names(path: Path, names: set[str]) -> list[str]:
-    """Return the names f_rest_0, f_rest_1, …, or raise InputError if their number does not match a degree."""
+    """Return the names f_rest_0, f_rest_1, …, or raise InputError if they do not match a degree."""
     count = sum(name.startswith("f_rest_") for name in names)
     expected = [f"f_rest_{i}" for i in range(count)]
     if count % 3 != 0 or count // 3 not in SH_DEGREES or not set(expected) <= names:

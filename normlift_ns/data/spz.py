@@ -1,7 +1,7 @@
-"""Niantic's SPZ files, which store quantized and compressed Gaussians (https://github.com/nianticlabs/spz).
+"""Reader and encoder for Niantic's SPZ files (https://github.com/nianticlabs/spz).
 
-A file of version 2 or 3 is one gzip stream of a header and all attributes. A file of version 4 has an uncompressed
-header, a table of sizes, and one zstd stream per attribute.
+The files contain quantized and compressed Gaussians. A file of version 2 or 3 is one gzip stream of a header and all
+attributes. A file of version 4 has an uncompressed header, a table of sizes, and one zstd stream per attribute.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from normlift_ns.io.memory import refuse_small_memory
 
 SPZ_MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
-"""Magic number, version, number of Gaussians, degree, fractional bits of the positions, flags, number of streams."""
+"""Magic number, version, number of Gaussians, SH degree, fractional bits of the positions, flags, number of streams."""
 _TABLE_OFFSET, _TABLE_ENTRY = struct.Struct("<16xI12x"), struct.Struct("<QQ")
-"""Header of version 4 with the offset of the table, and table entry with the compressed and uncompressed size."""
+"""Header of version 4 with the offset of the table, and table entry with the compressed and uncompressed sizes."""
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 """Bits of the flags in a header: antialiased Gaussians, and extensions in the file."""
 _MAX_FRACTIONAL_BITS, _MAX_FIXED = 23, 2**23 - 1
 _COLOR_SCALE, _SCALE_STEPS, _MIN_SCALE = 0.15, 16, -10
 _SH_STEPS = (8, 16)
-"""Quantization steps of spherical harmonics of degree 1 and of higher degrees, in 1/128, as in Niantic's library."""
+"""Quantization steps of harmonics of degree 1 and of higher degrees, in units of 1/128, as in Niantic's library."""
 _COMPONENT_STEPS = 511 * 2**0.5
-"""Quantization steps per unit of a quaternion component. All components except the largest are at most sqrt(1/2)."""
+"""Quantization steps per unit of a quaternion component. Packed components are in -sqrt(1/2)..sqrt(1/2)."""
 _MAX_RATIO = 1032
 """Maximum compression ratio of deflate."""
 _MAX_WINDOW = 2**27
@@ -63,15 +63,16 @@ def encode_spz(
     """Encode Gaussians as an SPZ file, in the order of their rows and in their own coordinates.
 
     Positions are rounded to multiples of a power of two, the smallest from 2^-23 to 1 for which all fit into 24 bits.
-    Logarithms of scales are rounded to 1/16 and clamped to -10..5.94. Opacities are rounded to 1/255. Constant
-    spherical harmonics are rounded to 1/38 and clamped to -3.33..3.33, others to 1/16 (degree 1) or 1/8 and -1..1.
-    Rotations change by at most 0.005 radians. Gaussians that are never drawn get opacity 0.
+    Logarithms of scales are rounded in steps of 1/16 and clamped to -10..5.94. Opacities are rounded in steps of 1/255.
+    Constant spherical harmonics are rounded in steps of 1/38 and clamped to -3.33..3.33. Other harmonics are rounded in
+    steps of 1/16 (degree 1) or 1/8 and clamped to -1..1. Rotations change by at most 0.005 radians. Gaussians that are
+    never drawn get opacity 0.
 
     Args:
         splat: Gaussians to encode.
         antialiased: True if they were trained with the rasterize mode "antialiased".
         version: Version of the format. More programs read version 3 than version 4.
-        position_step: Round positions to larger steps of up to this length, which makes the file smaller.
+        position_step: Maximum step of a coarser rounding of positions, for a smaller file; 0 for no coarser rounding.
     Raises:
         ValueError: A Gaussian that can be drawn is farther than 8,388,607 from the origin along an axis.
     """
@@ -245,7 +246,7 @@ def _decompress_zstd(data: bytes, size: int, path: Path) -> bytes:
 
 
 def _fractional_bits(means: Float[Tensor, "n 3"]) -> int:
-    """Return the largest number of fractional bits for which all coordinates fit into 24 bits."""
+    """Return the largest number of fractional bits, up to 23, for which all coordinates fit into 24 bits."""
     reach = float(means.abs().max()) if len(means) > 0 else 0.0
     if reach > _MAX_FIXED:
         raise InputError(
@@ -256,7 +257,7 @@ def _fractional_bits(means: Float[Tensor, "n 3"]) -> int:
 
 
 def _bits_of_step(step: float) -> int:
-    """Return the smallest number of fractional bits with steps of at most this length; the largest for length 0."""
+    """Return the smallest number of fractional bits, up to 23, with steps of at most `step`; 23 if `step` is 0."""
     return min(_MAX_FRACTIONAL_BITS, max(0, math.ceil(-math.log2(step)))) if step > 0 else _MAX_FRACTIONAL_BITS
 
 
@@ -265,7 +266,7 @@ def _floats(values: np.ndarray, *shape: int) -> Tensor:
 
 
 def _pack_quats(quats: Float[Tensor, "n 4"]) -> np.ndarray:
-    """Pack quaternions (x, y, z, w): 2 bits for the index of the largest component, and 10 bits for each other one."""
+    """Pack quaternions: 2 bits for the index of the largest of (x, y, z, w), and 10 bits for each other component."""
     index, components = split_largest(normalize_quats(quats).roll(-1, dims=1))
     steps = (components.abs() * _COMPONENT_STEPS).round().clamp(max=511).long() | ((components < 0).long() << 9)
     packed = index << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
@@ -280,7 +281,7 @@ def _unpack_quats(packed: np.ndarray) -> Float[Tensor, "n 4"]:
 
 
 def _unpack_first_three(packed: np.ndarray) -> Float[Tensor, "n 4"]:
-    """Unpack quaternions of version 2, which stores x, y and z with one byte each."""
+    """Unpack quaternions of version 2, which stores x, y and z in one byte each."""
     xyz = _floats(packed, len(packed) // 3, 3) / 127.5 - 1
     w = (1 - xyz.square().sum(dim=1, keepdim=True)).clamp(min=0).sqrt()
     return torch.cat([w, xyz], dim=1)

@@ -337,7 +337,7 @@ def _is_named_like(mask: Path, frame: FrameEntry) -> bool:
 
 _UNDISTORT = "Undistort the images, and write a camera file for them in the same coordinate system."
 _SAME = 1e-3
-"""Tolerance for equal intrinsics: pixels as a fraction of the longer image side, distortion as an absolute number."""
+"""Tolerance for equal intrinsics: relative to the longer image side for pixels, and absolute for distortion."""
 
 
 def _check_readings(entries: TransformsEntries, frame: FrameEntry, lens: Intrinsics, path: Path) -> None:
@@ -461,7 +461,7 @@ def _distortion(
     """Return the distortion parameters k1, k2, k3, p1, p2 and k4.
 
     Raises:
-        ValueError: A parameter that the camera type does not have is not zero. Such parameters are k4 of perspective
+        ValueError: A parameter that the camera type does not have is nonzero. Such parameters are k4 of perspective
             cameras, p1 and p2 of fisheye cameras, and k5 and k6.
     """
     values = [getattr(entry, name) or 0.0 for name in DISTORTION]
@@ -517,14 +517,14 @@ def _entry(frame: Frame) -> dict[str, Any]:
 
 
 _TOLERANCE = 1e-3
-"""Maximum deviation of a matrix from a similarity; numbers in files are rounded."""
+"""Maximum deviation of a matrix from a similarity, because numbers in files are rounded."""
 _MAX_MATRIX_BYTES = 2**16
 _EXPECTED_DATAPARSER = "the dataparser_transforms.json of a run; copy it again"
 _EXPECTED_MATRIX = "4 x 4 numbers in JSON, .npy or .txt, or the dataparser_transforms.json of a nerfstudio run"
 
 
 class _DataparserTransforms(msgspec.Struct):
-    """Contents of nerfstudio's dataparser_transforms.json: scale * (transform @ p) is in the world of the scene."""
+    """Contents of nerfstudio's dataparser_transforms.json, which maps a point p to scale * (transform @ p)."""
 
     transform: list[list[float]]
     scale: float
@@ -560,8 +560,8 @@ def capture_transforms(run_dir: Path, identity: Mapping[str, Any]) -> tuple[Worl
 
     Args:
         run_dir: Folder of the lifted run.
-        identity: Identity of the scene. For a splat without a nerfstudio run, `source_world` is the transform of its
-            cameras.
+        identity: Identity of the scene. For a splat without a nerfstudio run, `source_world` maps the world of the
+            cameras to the world of the splat.
     Raises:
         FileNotFoundError, ValueError: As in `read_dataparser_transforms`; also if `source_world` is invalid.
     """
@@ -657,9 +657,9 @@ def gsplat_normalization(frames: Sequence[Frame], points: Float[np.ndarray, "n 3
         frames: All registered images, sorted by name.
         points: Points of the reconstruction, at least four.
     Returns:
-        The similarity of the trainer. The similarity of the actual training may differ by half a turn about an axis.
-        The reason is that the signs of the axes depend on the linear algebra library. Versions of gsplat before 1.5 do
-        not flip the points.
+        The similarity that the trainer computes. That of the actual training may differ by half a turn about an axis,
+        because the signs of the axes depend on the linear algebra library. Versions of gsplat before 1.5 do not turn
+        the scene upside down.
     Raises:
         ValueError: The normalization cannot be computed, or the trainer's formula mirrors the world.
     """
@@ -714,7 +714,10 @@ def _upright(poses: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def _principal_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
-    """Return the transform that maps the median of points to the origin, their longest axis to x and shortest to z."""
+    """Return the transform that maps the median of the points to the origin, and their principal axes to x, y and z.
+
+    The longest axis maps to x, and the shortest axis to z.
+    """
     center = np.median(points, axis=0)
     covariance = np.cov(points - center, rowvar=False)
     if not np.isfinite(covariance).all():

@@ -34,15 +34,15 @@ _LIKELY, _MAX_LIKELY = 0.7, 4
 _SCALES = 1.12 ** np.arange(-61, 62)
 """Uniform scales that are tried, from about 0.001 to about 1000."""
 _SHRINKING = (0.04, 0.02, 0.01)
-"""Successive step sizes, in the logarithm of the scale, when points refine a scale."""
+"""Successive steps of the logarithm of the scale, in the refinement with points."""
 _PARABOLAS, _MAX_MOVES = ((100, 0.01), (400, 0.001)), 5
-"""Longer side of the renders that refine a scale further, with the step between the logarithms of their scales; maximum
-number of these steps."""
+"""Longer side in pixels of the renders that refine a scale further, with the step of the logarithm of the scale;
+maximum number of steps at each size."""
 _MIN_START = 2.0
-"""Minimum lead in dB of the PSNR of a first render over the PSNR of the mean color of its image."""
+"""Minimum lead in dB of the PSNR of a small render over the PSNR of the mean color of its image."""
 _TURN, _TURNED_SIDE = math.radians(1), 200
-"""Angle in radians of the rotations with which a correct world fits worse, and longer side in pixels of the renders
-that check this."""
+"""Angle in radians of the rotations that must not improve the fit of a correct world, and longer side in pixels of the
+renders that check this."""
 _SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 _ROUND = 1e-3
@@ -60,8 +60,8 @@ class _Points(NamedTuple):
     views: list[View]
 
     def agreement(self, worlds: Sequence[_Motion]) -> Float[Tensor, " w"]:
-        """Return the mean correlation in -1..1 of the images with the visible points, for cameras in each of the
-        worlds."""
+        """Return the mean correlation, in -1..1, between the images and the visible points, with the cameras moved to
+        each of the worlds."""
         values = torch.zeros(len(worlds))
         for view in self.views:
             poses = torch.stack([world.move(view.camera.world_to_camera) for world in worlds])
@@ -95,7 +95,7 @@ class _Points(NamedTuple):
 
 
 def _centered(image: Float[Tensor, "b c h w"], used: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "b c h w"]:
-    """Subtract the mean color of the pixels with weight 1 from an image, and set the pixels with weight 0 to 0."""
+    """Subtract from an image the mean color of its pixels with weight 1, and set its pixels with weight 0 to 0."""
     return (image - (image * used).sum(dim=(2, 3), keepdim=True) / used.sum().clamp(min=1)) * used
 
 
@@ -108,7 +108,7 @@ class _Motion(NamedTuple):
     """True if only one of the worlds has cameras with the axes of OpenCV."""
 
     def move(self, world_to_camera: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-        """Return the pose of a camera in the other world."""
+        """Return the pose of a camera in the second world."""
         pose = world_to_camera.double().numpy()
         if self.flipped:
             pose = np.diag([1.0, -1, -1, 1]) @ pose
@@ -135,7 +135,7 @@ class _Search:
         return _Motion(candidate.matrix @ self._back, candidate.opencv_cameras != self._flipped)
 
     def agreement(self, candidates: Sequence[CandidateWorld]) -> Float[Tensor, " w"]:
-        """Return the mean correlation of points of the splat with the images in each world, in -1..1."""
+        """Return the mean correlation, in -1..1, between points of the splat and the images in each world."""
         return self._points.agreement([self._motion(candidate) for candidate in candidates])
 
     def likely(self, candidates: Sequence[CandidateWorld]) -> list[CandidateWorld]:
@@ -143,7 +143,7 @@ class _Search:
         return [candidates[i] for i in _likely(self.agreement(candidates)) if i > 0 and self._is_near(candidates[i])]
 
     def likely_scales(self, candidates: Sequence[CandidateWorld]) -> list[CandidateWorld]:
-        """Return worlds that may fit with another uniform scale, by descending agreement."""
+        """Return uniformly rescaled copies of the worlds that may fit, by descending agreement."""
         unscaled = [
             candidate for candidate in candidates if candidate.world.scale == 1 and not candidate.opencv_cameras
         ]
@@ -175,7 +175,7 @@ class _Search:
         return small._replace(view=small.view._replace(camera=camera)).render(self._scene, self._gaussians, settings)
 
     def _refine(self, candidate: CandidateWorld, log: float) -> float | None:
-        """Return the logarithm of the scale that fits best, near a first guess; None if a render does not fit an image.
+        """Return the logarithm of the scale that fits best, from the guess `log`; None if its render does not fit.
 
         Points refine the guess to a few percent. Parabolas through the mean squared errors of renders of one view then
         refine it further.
@@ -190,7 +190,7 @@ class _Search:
         return log
 
     def _lowest(self, candidate: CandidateWorld, small: ReducedView, log: float, step: float) -> float:
-        """Return the minimum of the mean squared error over the logarithm of a scale, by a parabola through a grid."""
+        """Return the logarithm of the scale with the lowest mean squared error, by a parabola through three errors."""
 
         @cache
         def error(place: int) -> float:
@@ -225,7 +225,7 @@ def _likely(agreement: Float[Tensor, " w"]) -> list[int]:
 
 
 def _draw_points(scene: SplatScene, views: Sequence[ReducedView]) -> _Points:
-    """Sample points of the Gaussians with a fixed seed. Large and opaque Gaussians get more points."""
+    """Sample points from the Gaussians with a fixed seed. Large and opaque Gaussians get more points."""
     gaussians, generator = scene.gaussians, torch.Generator().manual_seed(0)
     rows = gaussians.drawable.nonzero().squeeze(1)
     rows = rows[:: len(rows) // _MAX_SAMPLED + 1]

@@ -41,7 +41,7 @@ _OPENCV_AXES = np.array([1.0, -1, -1, 1])
 
 
 class CandidateWorld(NamedTuple):
-    """A world in which a splat may lie."""
+    """World in which a splat may lie."""
 
     name: str
     """Noun phrase that names the world in messages."""
@@ -87,8 +87,8 @@ def candidate_worlds(file: SplatFile, options: SplatOptions, cameras: CameraFile
     """Return the worlds in which a splat may lie; the first is the one that the options and files state.
 
     With `--world-transform auto`, further worlds follow. They are the worlds of gsplat's trainer, ns-train and
-    `applied_transform`. Each is also tried with rotations between the axes of tools, and with cameras that have
-    OpenCV's axes.
+    `applied_transform`. Every world, including the first, is repeated with rotations between the axes of tools, and
+    with cameras that have OpenCV's axes.
 
     Raises:
         FileNotFoundError, ValueError: The world that the options or files state cannot be read or computed.
@@ -146,7 +146,7 @@ def _gsplat_world(options: SplatOptions, cameras: CameraFile) -> CandidateWorld:
 
 
 def _applied_worlds(cameras: CameraFile) -> Iterator[CandidateWorld]:
-    """Yield the worlds before and after the transform in transforms.json, unless it is not a similarity."""
+    """Yield the world before `applied_transform` and the world after a second one, if the transform is a similarity."""
     if cameras.applied_transform is None:
         return
     matrix = np.diag([*[cameras.applied_scale] * 3, 1.0]) @ cameras.applied_transform

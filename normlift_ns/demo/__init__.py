@@ -1,1 +1,1 @@
-"""The demo room, a small synthetic scene with ground truth, as tensors, a nerfstudio dataset and a trained run."""
+"""Demo room: a small synthetic scene with ground truth, as tensors, as a nerfstudio dataset and as a trained run."""

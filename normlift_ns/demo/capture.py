@@ -1,4 +1,4 @@
-"""Images and masks of the demo room as a nerfstudio dataset, and a splatfacto run of it."""
+"""Images and masks of the demo room as a nerfstudio dataset, and a splatfacto run on this dataset."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _FIELD_OF_VIEW = 75.0
 
 
 def demo_cameras(count: int = 24, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
-    """Return cameras on a circle inside the room, at three alternating heights, that point across the table.
+    """Return cameras on a circle inside the room, at three alternating heights, that point at the table.
 
     Sizes are in pixels.
     """
@@ -38,7 +38,7 @@ def demo_cameras(count: int = 24, width: int = WIDTH, height: int = HEIGHT) -> l
 
 
 def held_out_cameras(count: int = 4, width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
-    """Return cameras for evaluation, on a different circle from the cameras of `demo_cameras`."""
+    """Return cameras for evaluation, on a different circle from that of `demo_cameras`."""
     return [_look_at((1.25, 360 * (i + 0.4) / count, 1.5), (0, 0, 0.4), width, height) for i in range(count)]
 
 
@@ -107,7 +107,7 @@ def _look_at(
     """Return a camera that points at a target.
 
     Args:
-        position: Distance from the center of the room in meters, azimuth in degrees, and height in meters.
+        position: Horizontal distance from the center of the room in meters, azimuth in degrees, and height in meters.
         target: Position (x, y, z) in meters.
         width: Width of the image in pixels.
         height: Height of the image in pixels.
@@ -188,7 +188,7 @@ def splatfacto_config() -> Any:
 
 
 def to_dataparser_world(scene: GaussianScene, transform: Float[Tensor, "3 4"], scale: float) -> GaussianScene:
-    """Transform a scene to the coordinates of nerfstudio's dataparser, p' = scale (R p + t) for transform = [R | t]."""
+    """Transform a scene to the world of nerfstudio's data parser, p' = scale (R p + t) for transform = [R | t]."""
     rotation = Rotation.from_matrix(transform[:, :3].numpy())
     means = scale * (scene.means @ transform[:, :3].T + transform[:, 3])
     quats = (rotation * Rotation.from_quat(scene.quats.roll(-1, dims=1).numpy())).as_quat()  # SciPy puts w last

@@ -56,7 +56,7 @@ _FAINT_OPACITIES = (0.001, 0.1)
 
 @dataclass(frozen=True)
 class DemoRoom:
-    """A room of Gaussians with known colors and classes."""
+    """Room of Gaussians with known colors and classes."""
 
     scene: GaussianScene
     """Gaussians in float32 and meters; z points up."""
@@ -69,7 +69,7 @@ class DemoRoom:
 
 
 class Part(NamedTuple):
-    """A surface of one class. A room can have several parts of the same class."""
+    """Surface of one class. A room can have several parts of the same class."""
 
     name: str
     """Name of the class."""
@@ -93,14 +93,14 @@ class Surface(NamedTuple):
 
 
 SurfaceColors = Callable[[Sequence[Part], Surface, np.random.Generator], Array]
-"""Function that returns the sRGB colors [n, 3] of surface Gaussians with light and shadow. Values can be outside
+"""Function that returns the sRGB colors [n, 3] of surface Gaussians, including light and shadow. Values can be outside
 0..1."""
 
 
 class _Gaussians(NamedTuple):
     means: Array
     normals: Array
-    """Unit vectors [n, 3] along the third axis of `scales`."""
+    """Unit vectors [n, 3] along the axis of the third scale."""
     scales: Array
     opacities: Array
     colors: Array
@@ -145,7 +145,7 @@ def build_room(
 def _surface(
     parts: Sequence[Part], painter: SurfaceColors, area: float, count: int, rng: np.random.Generator
 ) -> _Gaussians:
-    """Cover all surfaces with Gaussians, except for those inside other parts."""
+    """Cover all surfaces with Gaussians, except where the surfaces lie inside other parts."""
     low, high = np.array([-HALF_WIDTH, -HALF_WIDTH, 0]), np.array([HALF_WIDTH, HALF_WIDTH, HEIGHT])
     density, shapes = _POINTS_PER_GAUSSIAN * count / area, [part.shape for part in parts]
     near = [sample_near_surface(part.shape, low, high, density * part.detail, rng) for part in parts]
@@ -258,7 +258,7 @@ def _interpolated(scene: Distance, points: Array) -> Distance:
 
 
 def visibility(scene: Distance, start: Array, direction: Array, distance: Array) -> Array:
-    """Return the fraction of a soft lamp that is visible from each point, [n].
+    """Return the fraction of an area light that is visible from each point, [n].
 
     Sphere tracing from the point to the lamp finds how closely the ray passes other surfaces.
     """
@@ -374,7 +374,7 @@ def banded(tones: Callable[[Array], Array], tint: tuple[float, float, float]) ->
 _TABLE = 0.62
 """Height of the table top in meters."""
 _EXPOSURE = 0.8
-"""Fraction of the surface of each part that is not brighter than the color of its name."""
+"""Fraction of the surface of each part that is not brighter than the color of its class."""
 _ROUGHNESS = 0.012
 """Standard deviation of the random factor on each color."""
 _DETAILED_AREA = 130.0
@@ -465,7 +465,7 @@ def _furniture() -> list[Part]:
 
 
 def _plant() -> list[Part]:
-    """Return a plant on the floor in the corner of the room."""
+    """Return a potted plant on the floor in a corner of the room."""
     x, y, rim = 1.18, -1.18, 0.42
     pot = union(place(cone(0.17, 0.23, 0.38, 0.012), x, y, 0.19), place(cone(0.255, 0.255, 0.08, 0.015), x, y, 0.38))
     vein = banded(lambda p: 1.2 - np.abs(p[:, 1]) / 0.008, _VEIN)
@@ -508,7 +508,7 @@ def _ring(count: int, radius: float, height: float) -> Array:
 
 
 def _bananas(x: float, y: float, z: float) -> list[Part]:
-    """Return a bunch of bananas with stems at (x, y, z) that arches over the table."""
+    """Return a bunch of bananas that arches over the table, with its stems at (x, y, z)."""
     tints, ripe = banded(shapes.banana_end, _STEM), np.array(_RIPE)
     banana = Part("banana yellow", 26, shapes.banana(0.044), lambda p: ripe * tints(p), 0.15)
     return [_at(banana, x, y, z + 0.012 * i, -75 + 17 * i, -62 + 16 * i) for i in range(4)]

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 Array = NDArray[np.float64]
 Distance = Callable[[Array], Array]
-"""Function that returns the signed distances [n] of points [n, 3] to a surface."""
+"""Function that returns the signed distances [n] from points [n, 3] to a surface."""
 
 ON_SURFACE = 1e-3
 """Largest distance in meters at which a point counts as lying on the surface."""
@@ -91,12 +91,12 @@ def union(*shapes: Distance) -> Distance:
 
 
 def row_lengths(vectors: Array) -> Array:
-    """Return the lengths [n] of rows [n, k], much faster than numpy.linalg.norm for short rows."""
+    """Return the lengths [n] of rows [n, k]. For short rows, this is much faster than numpy.linalg.norm."""
     return np.sqrt(np.einsum("nk,nk->n", vectors, vectors))
 
 
 def _outside(beyond: Array) -> Array:
-    """Return the distance to a convex body from the signed distances [n, k] to its perpendicular faces."""
+    """Return the signed distance to a convex body from the signed distances [n, k] to its perpendicular faces."""
     return row_lengths(beyond.clip(0)) + reduce(np.maximum, beyond.T).clip(None, 0)
 
 
@@ -161,7 +161,7 @@ def fit_surfels(shape: Distance, points: Array, first: NDArray[np.int64]) -> Sur
 
 
 def _nearest(centers: Array, sample: Array) -> NDArray[np.int64]:
-    """Return the index of the nearest center of each row of the sample."""
+    """Return the index of the nearest center for each row of the sample."""
     return np.asarray(KDTree(centers).query(sample)[1])
 
 
@@ -178,8 +178,8 @@ def _patch_means(values: Array, patch: NDArray[np.int64], empty: Array) -> Array
 Point = tuple[float, float, float]
 
 _NEAR = 0.25
-"""Distance in meters from the bounding sphere beyond which the sphere replaces the object, which makes lighting
-faster."""
+"""Distance in meters from the bounding sphere beyond which the sphere replaces the object, for faster
+lighting."""
 
 _DIMPLE = 0.38
 """Width of the dimple of a fruit, relative to its radius."""
@@ -256,7 +256,7 @@ BANANA_BEND, BANANA_ARC = 0.24, np.radians(55)
 
 
 def banana(radius: float) -> Distance:
-    """Return a banana that extends from its stem at the origin along -y, and is bent about z toward +x."""
+    """Return a banana that extends from its stem at the origin along -y, curved about z and bulging toward +x."""
     start = np.array([BANANA_BEND * np.cos(BANANA_ARC), BANANA_BEND * np.sin(BANANA_ARC), 0])
     stem = tapered((-0.035, 0.03, 0), (0, 0, 0), 0.3 * radius, 0.36 * radius)
 
@@ -271,7 +271,7 @@ def banana(radius: float) -> Distance:
 
 
 def banana_end(points: Array) -> Array:
-    """Return the proximity [n] of points to the dark ends of a banana, which is positive near the ends."""
+    """Return the proximity [n] of points to the dark ends of a banana, positive only near the ends."""
     x, y = BANANA_BEND * np.cos(BANANA_ARC), BANANA_BEND * np.sin(BANANA_ARC)
     to_end = BANANA_BEND * (BANANA_ARC - np.abs(np.arctan2(points[:, 1] + y, points[:, 0] + x)))
     return 1.6 - to_end / 0.012
@@ -322,7 +322,7 @@ def bowl(radius: float, thickness: float) -> Distance:
 
 
 def heap(centers: Array, radius: float) -> Distance:
-    """Return the union of spheres of equal radius."""
+    """Return the union of spheres of equal radius around the centers."""
     tree = KDTree(centers)
     return lambda p: np.asarray(tree.query(p)[0]) - radius
 

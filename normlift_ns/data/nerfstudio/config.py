@@ -1,4 +1,4 @@
-"""Safe reader for the config.yml of a nerfstudio run: YAML, allowed classes, value checks, and paths of the run."""
+"""Safe reader and writer for the config.yml of a nerfstudio run, with checks of its values and paths."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def compose_config(path: Path) -> yaml.MappingNode:
 
 
 def describe_yaml_error(error: Exception) -> str:
-    """Return the problem and the line number of a YAML error as one line."""
+    """Return a description of a YAML error without line breaks, with the line number if it is known."""
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     if isinstance(error, yaml.MarkedYAMLError):
@@ -120,7 +120,7 @@ class ConfigPaths:
 
     experiment: str | None
     output_dir: Path | None
-    """Folder that contains the experiment folder."""
+    """Folder of the experiments, as in `RunLocation`."""
     data: tuple[Path, ...]
     """Possible paths of the dataset; empty if they are unknown."""
 
@@ -149,7 +149,7 @@ class RunLocation:
     run_dir: Path
     """Folder of config.yml."""
     output_dir: Path
-    """Folder that contains experiment/method/timestamp (default: outputs/)."""
+    """Folder of the experiments (default: outputs/); for a moved run, a folder in the current directory."""
     root: Path | None
     """Working directory of the training, which stock ns-* commands need.
 
@@ -171,7 +171,7 @@ class RunLocation:
 
 
 def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunLocation:
-    """Locate the files of a run from the path of its config.yml, independent of the current directory.
+    """Locate the files of a run from the path of its config.yml.
 
     Paths in a config.yml are relative to the working directory of the training, which the file does not contain. The
     function infers this directory from the path output_dir/experiment/method/timestamp/config.yml.
@@ -206,7 +206,10 @@ def locate_run(config: Any, config_path: Path, data: Path | None = None) -> RunL
 
 
 def _folders(run_dir: Path, names: Sequence[str | None], output_dir: Path) -> tuple[Path, Path | None]:
-    """Return the folder that contains experiment/method/timestamp, and the working directory of the training or None.
+    """Return the folder of the experiments, and the working directory of the training.
+
+    For a run that is not in experiment/method/timestamp, the folder is in the current directory. The working directory
+    is None if it is unknown.
 
     Args:
         run_dir: Folder of config.yml.
@@ -282,7 +285,7 @@ class ConfigLoader(yaml.SafeLoader):
 
     nerfstudio uses `yaml.Loader`, which can import any module and call any function in the file. This loader imports
     no modules, and calls only the constructors of paths and one enum. Objects become instances of the mirror classes.
-    `unknown` collects the fields, with their values, that the mirror classes do not have.
+    `unknown` collects the fields that the mirror classes do not have, with their values.
     """
 
     def __init__(self, stream: str) -> None:
@@ -366,7 +369,7 @@ ConfigLoader.add_constructor(_TUPLE_TAG, _construct_tuple)
 
 
 class _ConfigDumper(yaml.Dumper):
-    """YAML dumper that writes mirror classes under the names of nerfstudio's classes."""
+    """YAML dumper that writes instances of mirror classes under the names of nerfstudio's classes."""
 
 
 def _represent(dumper: _ConfigDumper, config: Any) -> yaml.Node:
@@ -378,7 +381,7 @@ def _represent(dumper: _ConfigDumper, config: Any) -> yaml.Node:
 
 
 _NAMES = {name: _Name(name) for name in CLASS_TARGETS.values()}
-"""One object per name, so that a dump writes repeated names as YAML aliases, as it does for repeated classes."""
+"""One object per name, so that a dump writes repeated names as YAML aliases, as nerfstudio does for classes."""
 for _cls in CONFIG_CLASS_NAMES:
     _ConfigDumper.add_representer(_cls, _represent)
 _ConfigDumper.add_representer(_Name, lambda dumper, name: dumper.represent_scalar(_NAME_TAG + name.name, ""))
@@ -414,12 +417,12 @@ _REMEDY = "Restore the original config.yml of the run."
 _TRAINING_ONLY = re.compile(
     r"(machine|logging|viewer)\..*|pipeline\.datamanager\.(cache_images|cache_images_type|train_cameras_sampling_strategy)"
 )
-"""Names of fields that affect neither rendering nor the choice of the lifted images."""
+"""Pattern for the names of fields that affect neither rendering nor the choice of the lifted images."""
 _DRAWN = re.compile(
     r"2d|3dgut|unscented|kernel|filter|near_plane|far_plane|radius_clip|eps2d|camera_model|raster|render|modifier|"
     r"activation|antialias|appearance|embed|deform|motion|exposure|blur|distort"
 )
-"""Words in the names of fields that affect rendering or camera poses."""
+"""Words in the names of fields that may affect rendering or camera poses."""
 _CLASSES_OF_DRAWN = ("SplatfactoModelConfig", "NormLiftModelConfig", "CameraOptimizerConfig")
 _NOTHING = (None, False, 0, "", "off", "none", "default")
 
@@ -659,7 +662,10 @@ def read_trainer_config(path: Path, say: Callable[[str], None] = lambda text: No
 
 
 def with_absolute_paths(config: Any, location: RunLocation) -> Any:
-    """Return a copy of a config with absolute paths and without seed points, for use in any directory."""
+    """Return a copy of a config for use in any directory, with absolute paths of the dataset and the checkpoints.
+
+    The copy does not load seed points.
+    """
     config = deepcopy(config)
     set_dataset(config, location.data)
     skip_seed_points(config)

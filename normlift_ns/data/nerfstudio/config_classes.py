@@ -33,8 +33,8 @@ def _mirror(module: str, target: str | None = None) -> Callable[[_Class], _Class
 
     Args:
         module: Module of the mirrored class.
-        target: Name of the `_target` of the mirrored class, which may include its module (default: `module`). None for
-            no target.
+        target: Name of the `_target` of the mirrored class, with its module unless that is `module`; None for no
+            target.
     """
 
     def register(cls: _Class) -> _Class:
@@ -303,7 +303,7 @@ class SplatfactoModelConfig:
 
 @_mirror(f"{_OURS}.model", "NormLiftModel")
 class NormLiftModelConfig(SplatfactoModelConfig):
-    """Options of the model of a lifted run: those of splatfacto, and the path of the semantics."""
+    """Options of the model of a lifted run: splatfacto's options and the path of the semantic field."""
 
     semantics: Path | None = None
 
@@ -378,7 +378,7 @@ CONFIG_CLASSES: dict[str, type] = {
     "normlift_ns.options.SourceOptions": SourceOptions,
     "normlift_ns.options.RefineConfig": RefineConfig,
 }
-"""Classes that a config.yml may contain, by their names there."""
+"""Classes that a config.yml may contain, keyed by their names in the file."""
 
 
 NAMED_COLORS = {

@@ -35,7 +35,7 @@ _PARALLEL_TOLERANCE, _MIN_TILT = 1e-6, 0.17
 def normalize_poses(
     rows: Any, parser: config_classes.PosedDataParserConfig, orientation: str
 ) -> tuple[Float[Tensor, "v 3 4"], Float[Tensor, "3 4"], float]:
-    """Return poses in the world of the scene, the transform to this world, and its scale.
+    """Return poses in the world of the scene, the transform to this world before scaling, and the scale.
 
     Args:
         rows: 4 x 4 camera-to-world matrices in the world of the dataset.
@@ -59,7 +59,7 @@ def normalize_poses(
 def compose_applied_transform(
     transform: Float[Tensor, "3 4"], applied: Sequence[Sequence[float]] | None
 ) -> Float[Tensor, "3 4"]:
-    """Return the map that applies first `applied` and then `transform`, from the original world of the capture.
+    """Return the map from the original world of the capture that applies first `applied` and then `transform`.
 
     `applied` is the transform that was applied to the poses before they were stored, or None if there was none.
     """
@@ -280,8 +280,8 @@ def split_files(
     validation list if there is no test list. If there is only a training list, there are no evaluation images.
 
     Raises:
-        ValueError: There are lists, but no list of training images, or a listed file is missing. Also if eval_mode is
-            filename, and a file name contains neither train nor eval.
+        ValueError: There are lists, but no list of training images, or a listed file is not in `files`. Also if
+            eval_mode is filename, and a file name contains neither train nor eval.
     """
     if any(names is not None for names in lists.values()):
         held_out = [lists[split] for split in ("test", "val") if lists[split] is not None]
@@ -303,7 +303,7 @@ def split_files(
 
 
 def _listed_files(files: Sequence[Path], names: Any, split: str) -> Int[np.ndarray, " m"]:
-    """Return the indices of the files in the list of a split; raise InputError if the list or a file is missing."""
+    """Return the indices of the files in `names`; raise InputError if it is None or has a name that `files` lacks."""
     if names is None:
         raise InputError(f"the list of files of split {split} is missing")
     listed = set(names)
@@ -469,7 +469,7 @@ def _listed(folder: Path, name: str) -> Path:
 
 
 def _locate(file: Path, folder: Path) -> Path:
-    """Return the path of a listed file, or its path in the folder if the listed path is from another machine."""
+    """Return a listed path, or if it does not exist, the path of the same file in the folder if there is one."""
     if file.exists():
         return file
     name = relative_name(file, folder)
@@ -572,7 +572,7 @@ def _parse_colmap(parser: config_classes.ColmapDataParserConfig) -> ParsedDatase
 
 
 def _colmap_rows(cameras: Mapping[int, ColmapCamera], images: Sequence[ColmapImage]) -> tuple[str, list[list[float]]]:
-    """Return nerfstudio's type of all cameras, and a row of parameters for each image.
+    """Return nerfstudio's camera type, which all images share, and a row of parameters for each image.
 
     A row has fx, fy, cx, cy, width, height, k1, k2, k3, k4, p1 and p2.
     """

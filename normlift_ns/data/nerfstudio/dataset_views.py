@@ -26,7 +26,7 @@ class DatasetViews(SplitViews):
     """Views of a split of a dataset, read and undistorted by nerfstudio.
 
     Args:
-        dataset: Split from nerfstudio's datamanager, which stays unchanged.
+        dataset: Split from nerfstudio's data manager. The views do not change it.
         folder: Folder of the dataset, the base of the relative `names`.
         poses, background: As in `SplitViews`.
     """
@@ -114,7 +114,7 @@ def nerfstudio_views(
         config: Config of the run with absolute paths.
         folder: Folder of the dataset.
         poses: Camera-to-world poses of the training views.
-        background: RGB in 0..1, blended behind images with an alpha channel.
+        background: Color behind images with an alpha channel, RGB in 0..1.
     """
     # Loader is safe here: dump_config wrote the text, which contains allowed classes only
     datamanager = yaml.load(dump_config(config.pipeline.datamanager), Loader=yaml.Loader)

@@ -35,7 +35,7 @@ The parameters are k1, k2, k3, k4, p1 and p2, in this order.
 
 
 class TrainedViews(SplitViews):
-    """Views of a split of a dataset in its order, read and undistorted without nerfstudio.
+    """Views of a split of a dataset, in the same order, read and undistorted without nerfstudio.
 
     Images, masks and intrinsics equal those of nerfstudio's `FullImageDatamanager.cached_train`. Each access reads one
     image, whereas nerfstudio keeps all of them in memory.
@@ -60,9 +60,9 @@ class TrainedViews(SplitViews):
         self._split, parser = split, datamanager.dataparser
         alpha = parser.alpha_color if isinstance(parser, config_classes.BlenderDataParserConfig) else None
         self._alpha_color = None if alpha is None else config_classes.NAMED_COLORS[alpha.lower()]
-        """RGB in 0..1 that nerfstudio blends behind images with an alpha channel when it reads them.
+        """Color, RGB in 0..1, over which nerfstudio blends images with an alpha channel when it reads them.
 
-        None if nerfstudio blends the background later.
+        None if nerfstudio blends them later.
         """
         self._mask_color = parser.mask_color if isinstance(parser, config_classes.NerfstudioDataParserConfig) else None
         """Color that nerfstudio writes into pixels whose mask is zero."""
@@ -145,7 +145,7 @@ class NerfstudioScene:
     identity: Mapping[str, Any]
     """Path of the config and step of the checkpoint for the manifest; for lifted runs, also the version of gsplat."""
     remarks: tuple[str, ...] = ()
-    """Warnings about the images, in whole sentences."""
+    """Warnings about the config, the cameras and the images, in whole sentences."""
     extra_frames: tuple[Frame, ...] = ()
     """Frames of the extra views at the end of `train`, in the world of the Gaussians.
 
@@ -167,7 +167,7 @@ class NerfstudioScene:
 
     @property
     def runs_dir(self) -> Path:
-        """Folder that contains the experiment (default: outputs/)."""
+        """Folder of the experiments (default: outputs/); for a moved run, a folder in the current directory."""
         return self.location.output_dir
 
     @property
