@@ -97,7 +97,7 @@ class TorchCommunicator(Communicator):
         return result
 
     def claim_chunks(self, count: int) -> Iterator[int]:
-        """Claim chunks that are still unclaimed, starting with the share of this process, and yield their indices."""
+        """Claim free chunks, starting with the share of this process, and yield their indices."""
         key, self._num_divisions = f"{self._num_divisions}-", self._num_divisions + 1
         first = count * self.rank // self.world_size
         for index in [*range(first, count), *range(first)]:
@@ -105,7 +105,10 @@ class TorchCommunicator(Communicator):
                 yield index
 
     def aggregate_progress(self, report: ProgressCallback) -> ProgressCallback:
-        """Wrap a callback so that process 0 reports the sum of all processes in stages that count views."""
+        """Wrap a callback so that only process 0 reports progress.
+
+        In stages that count views, it reports the total of all processes.
+        """
         previous: dict[str, int] = {}
 
         def report_total(stage: str, done: int, total: int) -> None:
@@ -292,13 +295,13 @@ def _exchange_rows(
 
 
 class Halo(NamedTuple):
-    """Gaussians of a partition, followed by their neighbors in other processes."""
+    """Gaussians of this process, followed by their neighbors in other processes."""
 
     lifted: Lifted
     """Lift with the directions of all Gaussians of the halo. Neighbors in other processes have a norm, but all their
     other scalars are 0."""
     neighbors: Neighbors
-    """Neighbors of the partition's Gaussians, as row indices in `lifted`."""
+    """Neighbors of this process's Gaussians, as row indices in `lifted`."""
     gaussians: Int64[Tensor, " all"]
     """Index in the scene of each Gaussian of the halo."""
 
@@ -307,8 +310,8 @@ def gather_halo(lifted: Lifted, neighbors: Neighbors, portion: Partition) -> Hal
     """Gather the directions and neighbors that the vote needs for the Gaussians of this process.
 
     Args:
-        lifted: Lift of the partition.
-        neighbors: Neighbors of the partition's Gaussians, as indices in the scene.
+        lifted: Lift of this process's Gaussians.
+        neighbors: Neighbors of this process's Gaussians, as indices in the scene.
     """
     team, local, device = portion.communicator, portion.indices, portion.order.device
     _, row = portion.place

@@ -40,7 +40,7 @@ _LOOPBACK = {"linux": "lo", "darwin": "lo0"}
 
 
 def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | None:
-    """Return rank and world size from the variables of torchrun or `launch_processes`, or None for a single process.
+    """Return the rank and world size from variables of torchrun or `launch_processes`, or None for a single process.
 
     Raises:
         InputError: If a value is not a whole number, or the rank is not below the world size.

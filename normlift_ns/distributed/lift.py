@@ -181,7 +181,7 @@ def vote_distributed(
     """Run `vote_directions` in several processes.
 
     Returns:
-        The index of the Gaussian whose direction each Gaussian of the partition takes, the options with the resolved
+        The index of the Gaussian whose direction each Gaussian of this process takes, the options with the resolved
         parameters of the vote, and the manifest entries: the gate if it was measured, and the result of `vote_shares`.
     """
     team, gaussians = portion.communicator, portion.indices
@@ -229,7 +229,7 @@ def build_field_distributed(
     Args:
         lifted: Lift of this process's Gaussians.
         means: Centers of all Gaussians.
-        source: Result of the vote for this process's Gaussians, or None without a vote.
+        source: Index of the Gaussian whose direction each of this process's Gaussians takes, or None without a vote.
         portion: Gaussians of this process.
         tolerance: See `SemanticField.build`.
         storage: See `SemanticField.build`.

@@ -133,7 +133,7 @@ class FeatureSource(Protocol):
 
 @runtime_checkable
 class StoredMaps(Protocol):
-    """Label maps or features that a program has written to files, possibly at a different size from the images."""
+    """Label maps in files, with or without features. Their size can differ from that of the images."""
 
     @property
     def resample(self) -> bool:
@@ -175,8 +175,8 @@ class Regions(Protocol):
         """Return the region of each pixel in each level, selected or not. The result can be on any device.
 
         The region ids of a level are consecutive, 0..R-1, and unlabeled pixels are -1. A method without levels returns
-        one level. If regions overlap, the lift uses the region at depth 0, and only the encoder uses the others. A
-        method without overlaps returns a depth of 1.
+        one level. If regions overlap, the lift uses the region at depth 0, and only the encoder uses those at other
+        depths. A method without overlaps returns a depth of 1.
         """
         ...
 

@@ -6,9 +6,9 @@ factor. Colors are therefore compared in coordinates that discount this factor a
 
     p = 66 a* / (L* + 16),    q = 66 b* / (L* + 16),    x = (L* (1 + exp(-(p^2 + q^2) / 40^2)) / 2, p, q)
 
-Lightness counts fully for whites, grays and blacks, which differ only in lightness. It counts half for strong colors,
-whose lightness varies most in images. Each color is mapped to a unit vector phi(x). The cosine of two of these vectors
-decreases with the distance between their coordinates::
+Lightness counts fully for whites, grays and blacks, which differ only in lightness. It counts half as much for strong
+colors, whose lightness varies most in images. Each color is mapped to a unit vector phi(x). The cosine of two such
+vectors decreases with the distance between their coordinates::
 
     <phi(x), phi(y)> = exp(-|x - y|^2 / (2 sigma^2)),    sigma = 30
 

@@ -48,9 +48,9 @@ class ModelFamily:
     tokenizer_names: tuple[str, ...]
     """Substrings of the class names of the tokenizers."""
     mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    """Mean of each color channel, for values in 0..1; used if the configuration of a folder does not set it."""
+    """Channel means of pixel values in 0..1, for folders whose configuration does not set them."""
     std: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    """Standard deviation of each color channel; see `mean`."""
+    """Channel standard deviations of pixel values in 0..1, for folders whose configuration does not set them."""
 
 
 MODEL_FAMILIES = {

@@ -29,7 +29,7 @@ def find_classes(prompt: str) -> list[int]:
     """Return the indices of the classes that a prompt names, in ascending order.
 
     If the whole prompt is not in the vocabulary, it is cut before the first preposition or relative pronoun. Then the
-    longest known phrase at its end counts.
+    longest known phrase at its end is used.
 
     >>> find_classes("A red fox"), find_classes("two foxes in the snow"), find_classes("cup of tea")
     ([277], [277, 278, 279, 280], [968])

@@ -315,7 +315,7 @@ class LangSplat:
         )
 
     def _fit(self, maps: np.ndarray, image: Tensor, path: Path) -> np.ndarray:
-        """Resize maps to the size of the image; raise InputError if they may show another crop, unless `resample`."""
+        """Resize maps to the image; raise InputError if they may show another crop and `resample` is False."""
         height, width = image.shape[:2]
         if maps.shape[1:] == (height, width):
             return maps

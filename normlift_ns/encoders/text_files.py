@@ -35,7 +35,7 @@ class TextEncoder(Protocol):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Settings that identify the encoder, as JSON-serializable values."""
+        """Settings that identify the encoder, as JSON-serializable values; see `FeatureSource.identity`."""
         ...
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:

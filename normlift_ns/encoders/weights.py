@@ -146,7 +146,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def check_not_local(name: str, parts: int, subject: str, problem: str, remedy: str) -> None:
-    """Raise an error unless a name can be a tag or a hub name. Callers have accepted paths of usable weights already.
+    """Raise an error unless a name can be a tag or a hub name. Callers have already accepted paths of usable weights.
 
     Args:
         parts: 1 for tags, 2 for hub names of the form OWNER/NAME; see `is_local_path`.
