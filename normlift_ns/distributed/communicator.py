@@ -208,9 +208,9 @@ class EvidenceShard:
     """
 
     rows: list[CooEntries]
-    """Entries of labeled pixels, by the process that owns their Gaussians."""
+    """Entries of labeled pixels, with regions as columns, by the process that owns the Gaussians."""
     unlabeled: list[CooEntries]
-    """Entries of unlabeled pixels, by the process that owns their Gaussians."""
+    """Entries of unlabeled pixels, with views as columns, by the process that owns the Gaussians."""
     metadata: tuple[list[int], int, int, int]
     """Number of regions of each view, `weight_power`, `num_excluded`, and bytes per weight."""
 

