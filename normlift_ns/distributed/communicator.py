@@ -31,7 +31,7 @@ from normlift_ns.progress import ProgressCallback
 VIEW_STAGES = ("features", "evidence")
 """Names of the stages of a lift whose progress is counted in views."""
 _STALE_SECONDS = 7 * 86400
-"""Age in seconds at which a shared directory of killed processes is deleted."""
+"""Age in seconds after which a shared directory of killed processes is deleted."""
 
 
 @dataclass(kw_only=True)
@@ -97,7 +97,7 @@ class TorchCommunicator(Communicator):
         return result
 
     def claim_chunks(self, count: int) -> Iterator[int]:
-        """Yield chunks that no other process has claimed, beginning with the share of this process."""
+        """Claim free chunks, starting with the share of this process, and yield their indices."""
         key, self._num_divisions = f"{self._num_divisions}-", self._num_divisions + 1
         first = count * self.rank // self.world_size
         for index in [*range(first, count), *range(first)]:
@@ -105,7 +105,10 @@ class TorchCommunicator(Communicator):
                 yield index
 
     def aggregate_progress(self, report: ProgressCallback) -> ProgressCallback:
-        """Wrap a callback so that process 0 reports the sum of all processes in stages that count views."""
+        """Wrap a callback so that only process 0 reports progress.
+
+        In stages that count views, it reports the total of all processes.
+        """
         previous: dict[str, int] = {}
 
         def report_total(stage: str, done: int, total: int) -> None:
@@ -124,7 +127,7 @@ class TorchCommunicator(Communicator):
         Args:
             folder: Directory that all processes share.
         Raises:
-            InputError: The processes do not share the directory, or two processes can create the same file in it.
+            InputError: If the processes do not share the directory, or several of them can create the same file in it.
         """
         if self.rank == 0:
             for leftover in folder.glob("team-*"):  # from processes that were killed
@@ -161,7 +164,7 @@ def all_gather_sparse(team: Communicator, rows: SparseRows) -> SparseRows:
 
 
 def gather_sparse(portion: Partition, rows: SparseRows) -> SparseRows | None:
-    """Combine sparse matrices with one row per Gaussian in process 0; return None in all other processes."""
+    """Combine the rows of all Gaussians, in index order, in process 0; return None in all other processes."""
     parts = [portion.communicator.gather(x) for x in (rows.offsets.diff(), rows.column, rows.weight)]
     if any(part is None for part in parts):
         return None
@@ -176,7 +179,7 @@ def _offsets(lengths: Int64[Tensor, " n"]) -> Int64[Tensor, " n_plus_1"]:
 
 
 def _like(data: Tensor, rows: Tensor) -> Tensor:
-    """Convert bytes to rows with the shape, type and device of `rows`."""
+    """Convert bytes to an array whose rows have the shape, type and device of those of `rows`."""
     return data.flatten().view(rows.dtype).reshape(-1, *rows.shape[1:]).to(rows.device)
 
 
@@ -190,7 +193,7 @@ _RENUMBER_BLOCK = 2**20
 
 
 class CooEntries(NamedTuple):
-    """Entries of a sparse matrix in coordinate format, sorted by row, with 12 bytes per float32 entry."""
+    """Entries of a sparse matrix in coordinate format, sorted by row. An entry takes 12 bytes with float32 weights."""
 
     row: Int32[Tensor, " nnz"]
     column: Int32[Tensor, " nnz"]
@@ -199,15 +202,15 @@ class CooEntries(NamedTuple):
 
 @dataclass(frozen=True)
 class EvidenceShard:
-    """Evidence of a few views, split by the process that owns the Gaussians.
+    """Evidence of one chunk of views, split by the process that owns the Gaussians.
 
-    Row indices are those of the Gaussians in the partition of their owner.
+    Row indices are those of the arrays of the owner; see `Partition.place`.
     """
 
     rows: list[CooEntries]
-    """Entries of labeled pixels, by the process that owns their Gaussians."""
+    """Entries of labeled pixels, with regions as columns, by the process that owns the Gaussians."""
     unlabeled: list[CooEntries]
-    """Entries of unlabeled pixels, by the process that owns their Gaussians."""
+    """Entries of unlabeled pixels, with views as columns, by the process that owns the Gaussians."""
     metadata: tuple[list[int], int, int, int]
     """Number of regions of each view, `weight_power`, `num_excluded`, and bytes per weight."""
 
@@ -292,13 +295,13 @@ def _exchange_rows(
 
 
 class Halo(NamedTuple):
-    """Gaussians of a partition, followed by their neighbors in other processes."""
+    """Gaussians of this process, followed by their neighbors in other processes."""
 
     lifted: Lifted
     """Lift with the directions of all Gaussians of the halo. Neighbors in other processes have a norm, but all their
     other scalars are 0."""
     neighbors: Neighbors
-    """Neighbors of the partition's Gaussians, as row indices in `lifted`."""
+    """Neighbors of this process's Gaussians, as row indices in `lifted`."""
     gaussians: Int64[Tensor, " all"]
     """Index in the scene of each Gaussian of the halo."""
 
@@ -307,8 +310,8 @@ def gather_halo(lifted: Lifted, neighbors: Neighbors, portion: Partition) -> Hal
     """Gather the directions and neighbors that the vote needs for the Gaussians of this process.
 
     Args:
-        lifted: Lift of the partition.
-        neighbors: Neighbors of the partition's Gaussians, as indices in the scene.
+        lifted: Lift of this process's Gaussians.
+        neighbors: Neighbors of this process's Gaussians, as indices in the scene.
     """
     team, local, device = portion.communicator, portion.indices, portion.order.device
     _, row = portion.place

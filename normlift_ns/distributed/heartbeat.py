@@ -1,7 +1,8 @@
 """Heartbeats of the processes of a distributed lift, which detect lost processes.
 
-A thread of each process increments a counter in the shared store, even if an image takes hours. If a counter stops, the
-other processes report its process as lost, and exit. A process that fails reports its own error first.
+A thread of each process increments a counter in the shared store, even if one image takes hours to process. If a
+counter stops, the other processes report its process as lost, and exit. A process that fails reports its own error
+first.
 """
 
 from __future__ import annotations

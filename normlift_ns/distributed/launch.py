@@ -35,15 +35,15 @@ _JOIN_TIMEOUT = timedelta(minutes=10)
 _QUIET_WAIT = 15.0
 """Seconds of waiting before a message is printed."""
 _PR_SET_PDEATHSIG = 1
-"""Constant of prctl on Linux, which sets the signal that a process receives when its parent exits."""
+"""Option of Linux's prctl that sets the signal that a process receives when its parent exits."""
 _LOOPBACK = {"linux": "lo", "darwin": "lo0"}
 
 
 def rank_and_world_size(environment: Mapping[str, str]) -> tuple[int, int] | None:
-    """Return rank and world size from the variables of torchrun or `launch_processes`, or None for a single process.
+    """Return the rank and world size from variables of torchrun or `launch_processes`, or None for a single process.
 
     Raises:
-        InputError: A value is not a whole number, or the rank is not below the world size.
+        InputError: If a value is not a whole number, or the rank is not below the world size.
 
     >>> address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
     >>> rank_and_world_size({"RANK": "1", "WORLD_SIZE": "2", **address}), rank_and_world_size({})
@@ -102,7 +102,7 @@ def launch_processes(commands: Sequence[Sequence[str]], log: Callable[[str], Non
 
 
 def _watch(processes: Sequence[subprocess.Popen[bytes]], log: Callable[[str], None]) -> int:
-    """Wait for all processes, and return the exit code of `launch_processes`."""
+    """Wait until all processes succeed or one fails; return the exit code for `launch_processes`."""
     while True:
         codes = [process.poll() for process in processes]
         rank, code = next(((r, code) for r, code in enumerate(codes) if code), (0, 0))
@@ -152,8 +152,10 @@ def _die_with_parent(prctl: Callable[..., int], parent: int) -> None:
 def _use_single_gpu(local_rank: int, device: str) -> None:
     """Hide all GPUs except the one with the local rank of the process, before torch initializes CUDA.
 
+    Do nothing if the process uses the CPU.
+
     Raises:
-        InputError: The machine has no GPU for the local rank.
+        InputError: If the machine has no GPU for the local rank.
     """
     import torch  # noqa: PLC0415 (not needed by the launcher)
 
@@ -178,9 +180,9 @@ def distributed_context(device: str, log: Callable[[str], None]) -> Iterator[Tor
         log: Callback for messages about a long wait for other processes, and about a lost process that no other process
             reports.
     Raises:
-        InputError: The processes cannot connect, or the machine has too few GPUs. Also the errors of
+        InputError: If the processes cannot connect, or the machine has too few GPUs. Also for the same reasons as
             `rank_and_world_size`.
-        SystemExit: Another process failed or is lost. The exit code is 1.
+        SystemExit: If another process failed or is lost. The exit code is 1.
     """
     ranks = rank_and_world_size(os.environ)
     if ranks is None:

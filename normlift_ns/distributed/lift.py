@@ -108,7 +108,7 @@ def _collect(
     stages: StageTimer,
     kernels: Kernels,
 ) -> ViewObservations:
-    """Collect the chunks that this process can claim; return all views for the Gaussians of this process."""
+    """Collect the chunks that this process can claim; return the observations of all views for its Gaussians."""
     chunks = chunk_views(collection.views, team.world_size)
     tables: dict[int, tuple[Tensor, Tensor]] = {}
     pieces: dict[int, EvidenceShard] = {}
@@ -141,7 +141,7 @@ def consensus_distributed(views: ViewObservations, portion: Partition, *, sample
     """Run `consensus` in several processes. Process 0 computes it from the sampled Gaussians of all processes.
 
     Args:
-        sample: Minimum number of Gaussians in every region; see `consensus`.
+        sample: Smallest number of Gaussians to sample in a region; see `consensus`.
         options: Arguments `power` and `least` of `consensus`.
     """
     team, (evidence, features, level) = portion.communicator, views
@@ -158,7 +158,7 @@ def gather_sample(views: ViewObservations, portion: Partition, sample: int) -> t
     """Return the evidence and the sampling probabilities of the Gaussians that the processes sample, in index order.
 
     Args:
-        sample: Minimum number of Gaussians in every region; see `consensus`.
+        sample: Smallest number of Gaussians to sample in a region; see `consensus`.
     """
     team, evidence = portion.communicator, views.evidence
     chosen, probability = sample_gaussians(evidence.rows, evidence.num_regions, sample, portion)
@@ -181,8 +181,8 @@ def vote_distributed(
     """Run `vote_directions` in several processes.
 
     Returns:
-        The Gaussian whose direction each Gaussian of the partition takes, the options with the resolved parameters of
-        the vote, and the manifest entries: a measured gate, and the shares of `vote_shares`.
+        The index of the Gaussian whose direction each Gaussian of this process takes, the options with the resolved
+        parameters of the vote, and the manifest entries: the gate if it was measured, and the result of `vote_shares`.
     """
     team, gaussians = portion.communicator, portion.indices
     with stages("neighbors", len(gaussians)):
@@ -229,7 +229,7 @@ def build_field_distributed(
     Args:
         lifted: Lift of this process's Gaussians.
         means: Centers of all Gaussians.
-        source: Result of the vote for this process's Gaussians, or None without a vote.
+        source: Index of the Gaussian whose direction each of this process's Gaussians takes, or None without a vote.
         portion: Gaussians of this process.
         tolerance: See `SemanticField.build`.
         storage: See `SemanticField.build`.
@@ -246,7 +246,7 @@ def build_field_distributed(
 
 
 def _gather_evidence(lifted: Lifted, portion: Partition) -> lowrank.StoredEvidence | None:
-    """Return the evidence E and the features F of all partitions in process 0, and None in all other processes."""
+    """In process 0, return the evidence E of all Gaussians and the features F; return None in all other processes."""
     rows, unlabeled = (gather_sparse(portion, x) for x in (lifted.evidence.rows, lifted.evidence.unlabeled))
     if rows is None or unlabeled is None:
         return None
@@ -254,7 +254,7 @@ def _gather_evidence(lifted: Lifted, portion: Partition) -> lowrank.StoredEviden
 
 
 def _gather_directions(lifted: Lifted, basis: Tensor | None, portion: Partition) -> lowrank.StoredDirections | None:
-    """Return the directions of all Gaussians that have one in process 0, and None in all other processes."""
+    """In process 0, return the directions of all Gaussians that have one; return None in all other processes."""
     coordinates, rows = lowrank.encode_directions(lifted, basis, portion.blocks())
     parts, gaussians = portion.communicator.gather(coordinates), portion.communicator.gather(portion.indices[rows])
     if parts is None or gaussians is None:

@@ -1,11 +1,11 @@
-"""Protocols of feature sources, segmentation methods and encoders, with the classes that implement feature sources.
+"""Protocols for feature sources, segmentation methods and encoders, and basic implementations of feature sources.
 
 Segmentation and encoding are separate steps. `Regions` segments an image, and an `Encoder` embeds regions and prompts
 in a joint space. `RegionFeatures` combines the two into a `FeatureSource`, the protocol that the lift uses. A source
 that reads labels and features together, such as an importer, implements `FeatureSource` directly.
 
-An image can be segmented at several levels. The rasterizer computes evidence once, for the cells that all levels share
-(see `joint_partition`). The lift then sums the evidence over the regions of the selected levels.
+An image can be segmented at several levels. The rasterizer computes evidence once, for cells that are common to all
+levels (see `joint_partition`). The lift then sums the evidence over the regions of the selected levels.
 """
 
 from __future__ import annotations
@@ -38,12 +38,13 @@ from normlift_ns.segmentation.regions import is_downscaled, resample_nearest
 class ViewFeatures:
     """2D features of one image, on the CPU.
 
-    The rasterizer sums weights over cells. A region is a set of cells that share one feature. Cells depend on all
-    levels of an image, not only on the selected ones, so another selection can use the same cached evidence.
+    The rasterizer sums compositing weights over the pixels of each cell. A region is a set of cells with a common
+    feature. Cells depend on all levels of an image, not only on the selected ones, so the cached evidence is valid for
+    any selection.
 
     Raises:
-        ValueError: If a type, device or number of dimensions is wrong, an id is out of range, or a feature row is not a
-            unit vector.
+        ValueError: If a type, device or number of dimensions is wrong, a label or region index is out of range, or a
+            feature row is not a unit vector.
     """
 
     labels: Int32[Tensor, "h w"]
@@ -51,8 +52,8 @@ class ViewFeatures:
     features: Float32[Tensor, "r d"]
     """Feature of each region, a unit vector."""
     regions: Int32[Tensor, "levels c"] | None = None
-    """Region of each cell in each selected level, a row of `features`, or -1 if the cell is unlabeled. Each pixel
-    counts once in each level. None: each cell is a region."""
+    """Region of each cell in each selected level, as a row index of `features`, or -1 if the cell is unlabeled. Each
+    pixel counts once per level. If None, each cell is a region."""
 
     def __post_init__(self) -> None:
         for name, dtype in (("labels", torch.int32), ("features", torch.float32), ("regions", torch.int32)):
@@ -96,17 +97,17 @@ class FeatureSource(Protocol):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """All settings that change the result, as JSON-serializable values for the manifest.
+        """All settings that change the image features, as JSON-serializable values for the manifest.
 
         The device and the precision of encoders are excluded, because they affect only rounding.
         """
         ...
 
     def available(self, names: Sequence[str]) -> list[str]:
-        """Return the names of those images that have features; the lift ignores all other images.
+        """Return the names of the given images that have features; the lift ignores all other images.
 
         Raises:
-            ValueError, FileNotFoundError: For the errors of `view` that can be detected without reading an image.
+            ValueError, FileNotFoundError: If an error of `view` can be detected without reading an image.
         """
         ...
 
@@ -132,7 +133,7 @@ class FeatureSource(Protocol):
 
 @runtime_checkable
 class StoredMaps(Protocol):
-    """Label maps or features that a program wrote to files, at a size that may differ from that of the images."""
+    """Label maps in files, with or without features. Their size can differ from that of the images."""
 
     @property
     def resample(self) -> bool:
@@ -154,13 +155,12 @@ class Regions(Protocol):
 
     @property
     def chosen(self) -> tuple[int, ...]:
-        """Indices of the selected levels of `labels`. It may be empty if there is only one level."""
+        """Indices of the selected levels of `labels`; may be empty if there is only one level."""
         ...
 
     @property
     def at_once(self) -> int:
-        """Number of images to segment concurrently, one per thread; 1 if one image is enough to use the device
-        fully."""
+        """Number of images to segment concurrently, one per thread; 1 if a single image fully uses the device."""
         ...
 
     def files(self, name: str) -> tuple[Path, ...]:
@@ -172,11 +172,11 @@ class Regions(Protocol):
         ...
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "levels depth h w"]:
-        """Return the region of each pixel in all levels, selected or not, on any device.
+        """Return the region of each pixel in each level, selected or not. The result can be on any device.
 
         The region ids of a level are consecutive, 0..R-1, and unlabeled pixels are -1. A method without levels returns
-        one level. If regions overlap, the lift uses the region at depth 0, and only the encoder uses the others. A
-        method without overlaps returns a depth of 1.
+        one level. If regions overlap, the lift uses the region at depth 0, and only the encoder uses those at other
+        depths. A method without overlaps returns a depth of 1.
         """
         ...
 
@@ -209,8 +209,8 @@ class RegionFeatures:
     regions: Regions
     encoder: Encoder
     filled: Callable[[str, int, int], Bool[Tensor, "h w"]] | None = None
-    """Function that returns a mask of the pixels with a color, given the name, height and width of an image; None if
-    all pixels have a color. Other pixels do not belong to a region."""
+    """Function that returns a mask of valid pixels, given the name, height and width of an image; None if all pixels
+    are valid. Undistorted fisheye images can have invalid pixels, which do not belong to any region."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -250,10 +250,13 @@ class RegionFeatures:
     ) -> tuple[
         UInt8[Tensor, "h w 3"], Int32[Tensor, "levels depth h w"], Int32[Tensor, "h w"], Int32[Tensor, "levels c"]
     ]:
-        """Return the image on the CPU, its label maps, and its cells on the CPU with their regions in each level.
+        """Return the image, its label maps, the cell of each pixel, and the region of each cell in each level.
+
+        All tensors except the label maps are on the CPU.
 
         Raises:
-            InputError: If the image is invalid, a selected level is missing, or no level of several is selected.
+            InputError: If the image is invalid, a selected level is missing, or there are several levels and none is
+                selected.
         """
         image, name = view
         check_image(image, name)
@@ -288,7 +291,7 @@ def _limit_regions(
 def drop_zero_rows(
     features: Float32[Tensor, "r d"], regions: Int32[Tensor, "*n"]
 ) -> tuple[Float32[Tensor, "s d"], Int32[Tensor, "*n"]]:
-    """Remove zero rows from `features`, and renumber `regions`; regions without a feature become -1.
+    """Remove zero rows from `features`, and renumber `regions` accordingly; the ids of removed rows become -1.
 
     >>> drop_zero_rows(torch.tensor([[0.0], [1.0]]), torch.tensor([0, 1, -1], dtype=torch.int32))
     (tensor([[1.]]), tensor([-1,  0, -1], dtype=torch.int32))
@@ -326,14 +329,14 @@ def check_image(image: Tensor, name: str) -> None:
 
 
 def joint_partition(maps: Int32[Tensor, "levels h w"]) -> tuple[Int32[Tensor, "h w"], Int32[Tensor, "levels c"]]:
-    """Partition an image into cells, the sets of pixels that have the same label in all levels.
+    """Partition an image into cells. Two pixels are in the same cell if they have the same label in each level.
 
     Args:
         maps: Region of each pixel in each level, or -1 for none.
     Returns:
         The cell of each pixel, and the region of each cell in each level. Cells have consecutive ids from 0. Pixels
-        that are unlabeled in all levels have the cell -1, and cells without a region in a level have -1. For one level
-        with consecutive ids, cells equal regions.
+        that are unlabeled in all levels have the cell id -1. The region of a cell is -1 in levels in which the cell is
+        unlabeled. For one level with consecutive ids, cells equal regions.
     """
     if len(maps) == 1:
         counts = torch.bincount(maps.flatten() + 1)
@@ -397,7 +400,7 @@ class PatchFeatures:
     """
 
     encoder: DenseEncoder
-    """Encoder of the patches and of prompts."""
+    """Encoder of patches and prompts."""
     count: int = 1024
     """Approximate number of patches per image, at least 1."""
 
@@ -474,7 +477,7 @@ class PrecomputedFeatures:
     texts: Mapping[str, Float[Tensor, " d"]]
     """Embedding of each prompt."""
     divisor: int = 1
-    """Factor by which images were downscaled (`lift_downscale`). Labels of full-size images are downscaled to match."""
+    """Factor by which images were downscaled (`lift_downscale`). Labels at full size are downscaled to match."""
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -518,14 +521,15 @@ def precomputed_features(features: Any, texts: Mapping[str, Any] | None, names: 
 
     Args:
         features: Either one (labels, vectors) pair per training image, in order, or a mapping from image names to such
-            pairs, which may omit images.
+            pairs. A mapping may omit images.
         texts: Vector of each prompt, or None.
         names: Names of all training images.
     Raises:
         ValueError: If `features` or `texts` has the wrong type.
         ValueError: If `features` is empty, or a list whose length differs from that of `names`.
-        ValueError: If labels are not an integer matrix, or contain the id of a region without a vector.
-        ValueError: If vectors are not finite or not [regions, D], with the same D for all images and prompts.
+        ValueError: If labels are not a non-empty integer matrix, or a label is neither -1 nor the index of a vector.
+        ValueError: If vectors are not finite real numbers, or not [regions, D] with the same D for all images and
+            prompts.
         ValueError: If the vector of a prompt is not [D], is zero, or is not finite.
         ValueError: If a prompt is empty, ends in .npy or contains invalid characters.
     """
@@ -602,12 +606,12 @@ def _convert_text(text: str, values: Any) -> Tensor:
 
 
 def _describe(vectors: Tensor) -> str:
-    """Return the shape of an array for a message, and whether the array has values that are not finite."""
+    """Describe the shape of an array for a message, and note any values that are not finite."""
     return f"{tuple(vectors.shape)}{'' if bool(vectors.isfinite().all()) else ' with values that are not finite'}"
 
 
 def _to_floats(values: Any) -> Tensor:
-    """Return the values as a detached float32 or float64 tensor on the CPU; raise InputError if they are not real."""
+    """Convert values to a detached float32 or float64 CPU tensor; raise InputError if they are not real numbers."""
     try:
         tensor = values.detach().cpu() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, order="C"))
     except (TypeError, ValueError) as error:

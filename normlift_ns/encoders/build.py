@@ -24,12 +24,12 @@ from normlift_ns.segmentation.registry import MASK_SOURCES, check_mask_options, 
 
 
 def make_source(options: SourceOptions, device: str = "cpu") -> FeatureSource:
-    """Make the feature source that the options select: regions with an encoder, or features from a folder.
+    """Make the feature source that the options select: regions with an encoder, or a source with its own features.
 
     Args:
         device: Device of the networks; see `make_encoder`.
     Raises:
-        ValueError: If the name of the regions is unknown.
+        ValueError: If the name of the regions or of the features is unknown.
         ValueError: If a folder or level is missing, or has no effect with the other options.
         FileNotFoundError: If the folder of features does not exist.
         ValueError, FileNotFoundError: For the same reasons as `make_encoder`, `SamMasks` and `Sam3Masks`.
@@ -65,7 +65,7 @@ _PATHS = ("regions_dir", "features_dir", "text_embeddings")
 def source_settings(options: SourceOptions, device: str = "cpu") -> dict[str, Any]:
     """Return the options of a lift as JSON-serializable values for its manifest.
 
-    An automatic encoder and automatic regions are resolved as in `resolve_source`, and paths are absolute.
+    `resolve_source` replaces an automatic encoder and automatic regions. Paths are made absolute.
     """
     options = resolve_source(options, device)
     settings = {**asdict(options), **absolute_paths(options)}
@@ -123,7 +123,7 @@ _FEWEST = 5
 
 @cache
 def null_words() -> tuple[str, ...]:
-    """Return 200 names of objects, which research/null_words.py selects."""
+    """Return the 200 object names that research/null_words.py selected."""
     return tuple(json.loads(Path(__file__).with_name("null_words.json").read_text(encoding="utf8")))
 
 
@@ -133,8 +133,9 @@ def null_vectors(
     """Return the vectors of the null vocabulary of a lift.
 
     The vocabulary consists of the prompts that were supplied with precomputed features or in a file of text embeddings.
-    For other lifts, it is `null_words`. The result is None if the vocabulary has fewer than five words, or the encoder
-    cannot embed them. It is also None, with a warning, if the weights of the encoder are missing.
+    For other lifts, it is `null_words` if the encoder supports them, and otherwise empty. The result is None if the
+    vocabulary has fewer than five words, or the encoder cannot embed a word. It is also None, with a warning, if the
+    weights of the encoder are missing.
 
     Args:
         encoder: Encoder settings from the manifest.

@@ -32,7 +32,7 @@ REMEDY = "copy it from where the scene was lifted, or lift again with the same o
 
 
 _READERS = 8
-"""Number of cached images that are read in parallel."""
+"""Number of images whose cached features are read in parallel."""
 
 
 class NotCachedError(InputError):
@@ -77,7 +77,7 @@ class _Cached:
 
 @dataclass(frozen=True)
 class CachedRegions(_Cached):
-    """`Regions` that cache the label maps of all levels.
+    """An implementation of `Regions` that caches the label maps of all levels.
 
     The key depends on the image, its name, the files read for it, and all settings except the selected levels.
     """
@@ -130,13 +130,13 @@ class CachedEncoder(_Cached):
         yield from (rows for rows in pending if rows is not None)
 
     def path(self, image: UInt8[Tensor, "h w 3"], labels: Int32[Tensor, "depth h w"]) -> Path:
-        """Return the cache path of the region features of an image; the file may not exist."""
+        """Return the cache path of the features of the regions in `labels`; the file may not exist."""
         return cache_path(self.folder, self.identity, *_key_parts(image), *_key_parts(labels))
 
 
 @dataclass(frozen=True)
 class CachedPatches(_Cached):
-    """A `PatchFeatures` that caches the features of images.
+    """A wrapper of `PatchFeatures` that caches the features of images.
 
     The key depends on the image and the settings.
     """

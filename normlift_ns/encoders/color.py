@@ -1,14 +1,14 @@
 """Encoder that compares the colors of regions with color names. It has no learned weights and is robust to lighting.
 
 A region is represented by its mean CIELAB color, and a prompt by the colors that it names. `xkcd.json` has the 949
-names of the XKCD color survey. Shading scales the light of a surface, and thereby scales L* + 16, a* and b* by a common
+names of the XKCD color survey. Shading scales the light from a surface, and thereby L* + 16, a* and b*, by a common
 factor. Colors are therefore compared in coordinates that discount this factor and resemble CIELAB at L* = 50::
 
     p = 66 a* / (L* + 16),    q = 66 b* / (L* + 16),    x = (L* (1 + exp(-(p^2 + q^2) / 40^2)) / 2, p, q)
 
-Lightness counts fully for whites, grays and blacks, which differ only in lightness. It counts half for strong colors,
-whose lightness varies most in images. Each color is mapped to a unit vector phi(x). The cosine of two of these vectors
-decreases with the distance between their coordinates::
+Lightness counts fully for whites, grays and blacks, which differ only in lightness. It counts half as much for strong
+colors, whose lightness varies most in images. Each color is mapped to a unit vector phi(x). The cosine of two such
+vectors decreases with the distance between their coordinates::
 
     <phi(x), phi(y)> = exp(-|x - y|^2 / (2 sigma^2)),    sigma = 30
 
@@ -48,10 +48,10 @@ _STRONG_CHROMA = 40.0
 _LEVELS = 7
 _LEVEL_POWER = 1.5
 """Exponent of the sRGB levels of the anchors. Values above 1 make the lattice denser for dark colors, whose coordinates
-change fastest."""
+change fastest with the sRGB values."""
 _OWN_SHARE = 0.2
-"""Weight of a name's own color; the mean of its shades has the remaining weight. A smaller weight would move pure blue
-closer to purple than to blue."""
+"""Weight of a name's own color in `_family_vector`. Without this weight, the survey's blue would have a larger cosine
+with "purple" than with "blue"."""
 _JITTER = 1e-10
 _THREADS = min(8, os.cpu_count() or 1)
 """Number of images whose mean colors are computed concurrently."""
@@ -61,14 +61,15 @@ _NOT_SUGGESTED = frozenset({"barf", "booger", "diarrhea", "piss", "poo", "poop",
 
 @dataclass(frozen=True)
 class ColorEncoder(LazyTextEncoder):
-    """Encoder that compares mean CIELAB colors with color names, without weights or a GPU; see the module docstring."""
+    """An encoder that compares mean CIELAB colors with color names. It uses no weights and no GPU; see the module
+    docstring."""
 
     @property
     def identity(self) -> dict[str, Any]:
         return {"kind": "colour", "sigma": KERNEL_SIGMA}
 
     def rows(self, prompts: Sequence[str]) -> Float32[np.ndarray, "q d"]:
-        """Return one unit vector per prompt, the normalized mean of the vectors of all colors that it names.
+        """Return one unit vector per prompt, the normalized mean of the vectors of all color names in the prompt.
 
         A name stands for all colors of the survey whose names end in it: "red" includes brick red and dull red.
 
@@ -113,7 +114,7 @@ def _mean_lab(view: tuple[UInt8[Tensor, "h w 3"], Int32[Tensor, "depth h w"]]) -
 
 
 def _unique_lab(image: UInt8[np.ndarray, "h w 3"]) -> tuple[Float64[np.ndarray, "colors 3"], Int64[np.ndarray, " p"]]:
-    """Return the CIELAB values of the distinct colors of an image, and the row of the color of every pixel.
+    """Return the CIELAB values of the distinct colors of an image, and the row of each pixel's color.
 
     Pixels are in row-major order. Each color is converted once, because conversions take most of the encoder's time.
     """
@@ -130,7 +131,7 @@ def _unique_lab(image: UInt8[np.ndarray, "h w 3"]) -> tuple[Float64[np.ndarray, 
 
 @cache
 def _family_vector(name: str) -> Float64[np.ndarray, " 343"]:
-    """Return the unit vector of a name, a weighted mean of its own color and of all colors whose names end in it."""
+    """Return the unit vector of a color name, a weighted mean of its own color and all colors whose names end in it."""
     shades = [lab for other, lab in _names().items() if f" {other}".endswith(f" {name}")]
     family = _normalized(embed_colors(np.stack(shades)).mean(axis=0, keepdims=True))
     (row,) = _normalized(_OWN_SHARE * embed_colors(_names()[name][None]) + (1 - _OWN_SHARE) * family)
@@ -180,7 +181,7 @@ def _words(text: str) -> list[str]:
 
 @cache
 def xkcd_colors() -> dict[str, str]:
-    """Return the color "#rrggbb" of each name, in the spelling of the XKCD color survey."""
+    """Return the colors of the XKCD color survey as "#rrggbb", by name."""
     return json.loads(Path(__file__).with_name("xkcd.json").read_text(encoding="utf8"))
 
 

@@ -184,7 +184,7 @@ def _batches(device: str) -> AdaptiveBatches:
 
 
 class _PendingView(NamedTuple):
-    """A view with regions that are not all encoded yet. Its tensors are on the device of the network."""
+    """A view whose regions are not all encoded yet. Its tensors are on the device of the network."""
 
     image: UInt8[Tensor, "h w 3"]
     labels: Int32[Tensor, "depth h w"]
@@ -238,7 +238,7 @@ def masked_crops(
 def _bilinear_samples(
     side: Tensor, margin: Tensor, length: Tensor, start: Tensor, size: int
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Return the positions and weights of bilinear interpolation of each square along one axis.
+    """Return positions and weights for the bilinear interpolation of each square along one axis.
 
     The result has two entries, for the pixels before and after each sample. An entry contains the positions in the
     image, the weights, and a mask. The mask is True for pixels inside the box, and False for pixels in the margin.

@@ -48,9 +48,9 @@ class ModelFamily:
     tokenizer_names: tuple[str, ...]
     """Substrings of the class names of the tokenizers."""
     mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    """Mean of pixels in 0..1 for folders whose configuration does not set it."""
+    """Channel means of pixel values in 0..1, for folders whose configuration does not set them."""
     std: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    """Standard deviation of pixels in 0..1 for folders whose configuration does not set it."""
+    """Channel standard deviations of pixel values in 0..1, for folders whose configuration does not set them."""
 
 
 MODEL_FAMILIES = {
@@ -120,13 +120,13 @@ _MAX_SIZES = {
     "num_attention_heads": 256, "max_position_embeddings": 2**12, "projection_size": 2**14, "projection_dim": 2**14,
     "image_size": 2**12, "patch_size": 2**8, "num_patches": 2**16, "eos_token_id": 2**21, "num_channels": 3,
 }  # fmt: skip
-"""Configuration entries in use, with their largest accepted values."""
+"""Integer configuration entries that this module reads, with their largest accepted values."""
 _ACTIVATIONS = ("gelu", "gelu_fast", "gelu_new", "gelu_pytorch_tanh", "quick_gelu", "relu", "silu")
 
 
 @dataclass(frozen=True)
 class PixelNormalization:
-    """Normalization of pixel values x in 0..255 for the network: (rescale_factor x - mean) / std."""
+    """Image preprocessing of a network, which maps pixel values x in 0..255 to (rescale_factor x - mean) / std."""
 
     rescale_factor: float
     mean: tuple[float, ...]
@@ -158,7 +158,8 @@ class ModelFolder:
     text: dict[str, Any]
     vision: dict[str, Any]
     sizes: dict[str, Any]
-    """`projection_dim`, if the configuration has it. The keys of all sizes are those of transformers configurations."""
+    """Dimension of the joint embedding space, if config.json sets it. `text`, `vision` and `sizes` have the same
+    keys as the configurations of transformers."""
     pixels: PixelNormalization
     tokens: TokenPadding
     weights: tuple[Path, ...]
@@ -209,7 +210,7 @@ def _other_architecture(origin: str, config: Mapping[str, Any], family: ModelFam
 
 
 def _sizes(values: object, where: str) -> dict[str, Any]:
-    """Return the sizes that a configuration contains; raise InputError if one is invalid."""
+    """Return the sizes and other settings of a network from a configuration; raise InputError if one is invalid."""
     if values is None:
         return {}
     if not isinstance(values, Mapping):
@@ -235,7 +236,7 @@ def _sizes(values: object, where: str) -> dict[str, Any]:
 
 
 def _number(value: object, name: str, minimum: float, maximum: float) -> float:
-    """Return a number as float; raise InputError unless it is in minimum..maximum."""
+    """Return a value as a float; raise InputError unless it is a number in minimum..maximum."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not minimum <= value <= maximum:
         raise InputError(f"{name} is {value!r:.40}, expected a number in {minimum:g}..{maximum:g}")
     return float(value)
@@ -285,7 +286,7 @@ def _side(settings: Mapping[str, Any]) -> int | None:
 
 
 def _tokens(path: Path, family: ModelFamily) -> TokenPadding:
-    """Read the padding of texts; raise InputError if the tokenizer is missing or belongs to another family."""
+    """Read the padding of texts; raise InputError if it is invalid, or the tokenizer is missing or unsuitable."""
     if not (path / TOKENIZER_FILE).is_file():
         older = "; spiece.model, an older format, is not supported" if (path / "spiece.model").is_file() else ""
         raise InputError(f"{TOKENIZER_FILE}, which encodes texts, is missing{older}")
@@ -310,7 +311,7 @@ def _tokens(path: Path, family: ModelFamily) -> TokenPadding:
 
 
 def _weights(path: Path) -> tuple[Path, ...]:
-    """Return the weight file, or the shards that the index lists; raise InputError if a file is missing."""
+    """Return the weight file or the listed shards; raise InputError if a file is missing or the index is invalid."""
     if (path / WEIGHTS_FILE).is_file():
         return (path / WEIGHTS_FILE,)
     if not (path / WEIGHTS_INDEX_FILE).is_file():
@@ -392,7 +393,7 @@ def check_model_name(model: str, family: ModelFamily) -> None:
 
 
 def find_local_model(model: str) -> Path | None:
-    """Return the folder, if `model` is one, or the network's folder in the hub cache; None if it is not cached."""
+    """Return `model` if it is a folder, or else the network's folder in the hub cache, or None if it is not cached."""
     files = (WEIGHTS_FILE, WEIGHTS_INDEX_FILE)
     return Path(model).resolve() if os.path.isdir(model) else weights.find_cached_model(model, files)
 

@@ -1,4 +1,4 @@
-"""Encoder of images and prompts with Hugging Face networks.
+"""Encoder of images and prompts that uses Hugging Face networks.
 
 SigLIP pools the tokens of all patches by attention with one learned query. Patch features use only the value path of
 this pooling, as MaskCLIP (Zhou, Loy and Dai, ECCV 2022) does for the attention pooling of CLIP's ResNets. After the
@@ -33,7 +33,7 @@ from normlift_ns.io.guard import check_regular
 from normlift_ns.options import CropFill
 
 _CLASSES = {"siglip": "Siglip", "siglip2": "Siglip2", "metaclip_2": "MetaClip2"}
-"""Prefixes of class names in transformers, by architecture."""
+"""Prefixes of class names in transformers, by model type."""
 
 
 @dataclass
@@ -88,7 +88,7 @@ class HuggingFaceNetwork:
         return self._finite(lambda: self._value_path(pixels))
 
     def texts(self, texts: Sequence[str]) -> Float[Tensor, "b d"]:
-        """Return unnormalized embeddings of texts, which `ModelFamily.preprocess_text` has prepared.
+        """Return unnormalized embeddings of texts that `ModelFamily.preprocess_text` has prepared.
 
         Raises:
             InputError: If the tokenizer returns a token that the network does not have, or embeddings are not finite.
@@ -123,7 +123,7 @@ class HuggingFaceNetwork:
         }
 
     def _value_path(self, pixels: Tensor) -> Tensor:
-        """Return patch embeddings by the value path; see the module docstring."""
+        """Return patch embeddings from the value path; see the module docstring."""
         vision = self.model.vision_model
         if self._is_clip:
             last = vision.encoder.layers[-1]
@@ -171,8 +171,8 @@ def load_huggingface_network(
     """Load the network of a model folder.
 
     Raises:
-        InputError: If the folder is damaged or does not match its configuration, or transformers does not support the
-            network.
+        InputError: If a file is damaged, the weights do not match the configuration, or transformers does not support
+            the network.
     """
     remedy = (
         f"lift with --encoder-model set to another folder or to a name such as {family.default_model}, or with "
@@ -191,7 +191,7 @@ def _build_model(folder: huggingface.ModelFolder) -> Any:
     """Build the model from the checked sizes, and load its weights in float32.
 
     Raises:
-        InputError: If the image sizes of the files differ, or a weight is not a float.
+        InputError: If the image sizes of the preprocessing and of the network differ, or a weight is not a float.
         Exception: If the weights do not match the model, or cannot be read.
     """
     transformers = importlib.import_module("transformers")

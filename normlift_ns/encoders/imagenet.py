@@ -26,10 +26,10 @@ _AFTER_HEAD = re.compile(r"\b(?:of|on|in|with|at|under|by|near|behind|from|for|t
 
 
 def find_classes(prompt: str) -> list[int]:
-    """Return the classes that a prompt names, in ascending order.
+    """Return the indices of the classes that a prompt names, in ascending order.
 
-    If the whole prompt is not known, it is cut before the first preposition or relative pronoun. Then the longest known
-    phrase at its end counts.
+    If the whole prompt is not in the vocabulary, it is cut before the first preposition or relative pronoun. Then the
+    longest known phrase at its end is used.
 
     >>> find_classes("A red fox"), find_classes("two foxes in the snow"), find_classes("cup of tea")
     ([277], [277, 278, 279, 280], [968])
@@ -91,7 +91,7 @@ def _table() -> dict[str, Any]:
 
 @cache
 def _vocabulary() -> dict[str, tuple[int, ...]]:
-    """Return the classes of each name, hypernym and last word of a name, all normalized."""
+    """Return the class indices of each name, hypernym and last word of a name. All keys are normalized."""
     known: dict[str, set[int]] = {}
     heads: dict[str, set[int]] = {}
     for number, names in enumerate(_table()["classes"].values()):

@@ -3,7 +3,7 @@
 The classifier averages 1,280 feature maps over an image and multiplies the mean by one vector per class. The encoder
 normalizes the features and averages them over a region, so that all pixels count equally. The cosine of this mean and a
 class vector measures how much the region looks like the class. Features are 32 pixels apart, so the image is encoded at
-twice its size. Its longer side is limited to about 2,048 pixels.
+twice its size. The longer side after scaling is limited to about 2,048 pixels.
 
 Convolutions are padded equally on both sides, so that feature (i, j) is centered on pixel (32 i, 32 j). An image with
 32 m + 1 rows has m + 1 rows of features, from its first to its last row. TensorFlow, which was used for training, pads
@@ -36,7 +36,8 @@ WIDTH, CLASSES = 1280, 1000
 """Number of feature channels, and number of classes."""
 _STAGES = ((1, 3, 1, 1, 16), (3, 3, 2, 6, 24), (3, 5, 2, 6, 48), (4, 3, 2, 6, 88), (4, 5, 1, 6, 120), (5, 5, 2, 6, 208),
            (1, 3, 1, 6, 352))  # fmt: skip
-"""Blocks, kernel size, stride of the first block, expansion and channels of each stage of EfficientNet-Lite2."""
+"""Number of blocks, kernel size, stride of the first block, expansion factor and output channels of each stage of
+EfficientNet-Lite2."""
 _STEM = 32
 _LAYERS = (("conv_stem", "bn0"), ("expand_conv", "bn0"), ("depthwise_conv", "bn1"), ("project_conv", "bn2"),
            ("conv_head", "bn1"))  # fmt: skip
@@ -97,11 +98,11 @@ class EfficientNetLite2(nn.Module):
 
 
 def load_network(content: bytes, device: str) -> EfficientNetLite2:
-    """Load the network from the content of a PyTorch weight file, whose parameter names begin with underscores.
+    """Load the network from the content of a PyTorch weight file.
 
-    Batch normalizations are fused into the preceding convolutions, which halves the time on a CPU. The memory format
-    is the fastest one on each kind of device. On a GPU, cuDNN would compile channels-last depthwise convolutions for
-    three seconds.
+    Leading underscores are removed from the parts of parameter names. Batch normalizations are fused into the preceding
+    convolutions, which halves the inference time on a CPU. The memory format is channels-last on a CPU. On a GPU, it is
+    the default, because cuDNN would spend three seconds compiling channels-last depthwise convolutions.
     """
     state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     with torch.device("meta"):
@@ -185,8 +186,8 @@ class ImageNetEncoder:
 def pool_regions(maps: Float32[Tensor, "d rows columns"], labels: Int32[Tensor, "depth h w"]) -> Float32[Tensor, "r d"]:
     """Return the normalized mean feature of each region, on the CPU, or a zero row if the mean is zero.
 
-    Features are interpolated bilinearly at the pixels. The interpolation weights are summed per region first, so that
-    one product of a regions x features matrix with the features is enough.
+    Features are interpolated bilinearly at the pixels. The interpolation weights are first summed per region, so that
+    a single matrix product computes all means.
     """
     rows, columns = maps.shape[1:]
     _, y, x = (labels >= 0).nonzero(as_tuple=True)
@@ -204,9 +205,9 @@ def pool_regions(maps: Float32[Tensor, "d rows columns"], labels: Int32[Tensor, 
 
 
 def _positions(pixels: int, features: int) -> tuple[Int64[Tensor, " pixels"], Float64[Tensor, " pixels"]]:
-    """Return the feature before each pixel along one axis, and the interpolation weight of the next feature.
+    """Return the index of the feature before each pixel along one axis, and the interpolation weight of the next one.
 
-    The first and last features are centered on the first and last pixels of the enlarged image.
+    The first and last features are centered on the first and last pixels of the scaled image.
     """
     place = ((torch.arange(pixels).double() + 0.5) * ((features - 1) * _STRIDE + 1) / pixels - 0.5) / _STRIDE
     place = place.clamp(0, features - 1)

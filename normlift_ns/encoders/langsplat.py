@@ -315,7 +315,7 @@ class LangSplat:
         )
 
     def _fit(self, maps: np.ndarray, image: Tensor, path: Path) -> np.ndarray:
-        """Resize maps to the size of the image; raise InputError if they may show another crop."""
+        """Resize maps to the image; raise InputError if they may show another crop and `resample` is False."""
         height, width = image.shape[:2]
         if maps.shape[1:] == (height, width):
             return maps
@@ -335,7 +335,7 @@ class LangSplat:
 
 
 def is_same_image(map_width: int, map_height: int, width: int, height: int) -> bool:
-    """Return True if a map can show the same image, at the same or a different resolution.
+    """Return True if a map can show the same crop as an image, at the same or a different resolution.
 
     The sizes must have the same aspect ratio, except for rounding of the smaller size to whole pixels. Sizes
     within 2 % of each other must be equal, because a small difference is probably a crop.
@@ -393,12 +393,12 @@ def write_langsplat(
 ) -> None:
     """Write the regions and features of an image as `<stem>_s.npy` and `<stem>_f.npy`.
 
-    Regions with four levels fill LangSplat's four channels. For other regions, the selected level fills all four.
+    Regions with four levels fill LangSplat's four channels. For other sources, the selected level fills all four.
 
     Args:
         overwrite: True to replace existing files that have different content.
     Raises:
-        ValueError: If the source selects several levels.
+        ValueError: If several levels are selected, and the source does not have four levels.
         FileExistsError: If a file with different content exists, and `overwrite` is False.
     """
     levels: list[tuple[Tensor, Tensor]] = []

@@ -1,7 +1,7 @@
 """Architectures and weight files of OpenCLIP, without importing all of open_clip.
 
 Importing the whole package takes ten seconds, mostly for torchvision and transformers, and is necessary only to build a
-network. This module imports single modules of open_clip instead.
+network. All functions except `import_open_clip` avoid this import.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _WEIGHT_FILES = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin")
 
 
 def import_open_clip_module(name: str) -> ModuleType:
-    """Import a module of open_clip, without the rest of the package if that is not imported yet.
+    """Import a module of open_clip, without the rest of the package if it is not imported yet.
 
     Raises:
         ImportError: If the module does not exist, or needs the rest of the package.
@@ -222,7 +222,7 @@ def find_open_clip_weights(model: str, pretrained: str) -> tuple[Path, dict[str,
 def find_local_clip_weights(model: str, pretrained: str) -> tuple[Path | None, dict[str, Any]]:
     """Return the weight file, and the settings as in `find_open_clip_weights`.
 
-    The file is None if `pretrained` is not a local file and the hub cache does not have its weights.
+    The file is None if `pretrained` is not a local file and the weights are not in the hub cache.
     """
     table = import_open_clip_module("pretrained")
     if os.path.isfile(pretrained):

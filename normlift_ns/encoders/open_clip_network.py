@@ -1,4 +1,4 @@
-"""Encoder of images and prompts with OpenCLIP networks, and OpenCLIP's text tower in plain torch."""
+"""Encoder of images and prompts that uses OpenCLIP networks, and OpenCLIP's text tower in plain torch."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class OpenClipNetwork(NamedTuple):
 
 
 class _Uninitialized(TorchFunctionMode):
-    """A context that skips the random initialization of modules in this thread, for weights that a file replaces."""
+    """A context that skips the random initialization of modules in this thread. A weight file sets the values later."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if getattr(func, "__module__", None) == "torch.nn.init":
@@ -208,7 +208,7 @@ class OpenClipEncoder(NetworkEncoder):
 
 
 _PLAIN_KEYS = {"context_length", "vocab_size", "width", "heads", "layers"}
-"""Configuration keys of a text tower of the standard architecture; any other key indicates another one."""
+"""Configuration keys of a text tower of the standard architecture; any other key indicates a different architecture."""
 _TEXT_BATCH_SIZE = 64
 
 

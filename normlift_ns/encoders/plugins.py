@@ -39,7 +39,7 @@ class PluginEncoder(Encoder):
 
     @classmethod
     def made(cls, name: str, make: Callable[[], Encoder]) -> PluginEncoder:
-        """Make an encoder, and check that it has the required attributes."""
+        """Make an encoder, check that it has the required attributes, and return its adapter."""
         encoder = _make("encoder", name, make, ("identity", "encode", "text"))
         return DensePluginEncoder(name, encoder) if hasattr(encoder, "patches") else cls(name, encoder)
 
@@ -110,7 +110,7 @@ class PluginRegions:
 
     @classmethod
     def made(cls, name: str, make: Callable[[], object]) -> PluginRegions:
-        """Make a mask source, and check that it has the required attributes."""
+        """Make a mask source, check that it has the required attributes, and return its adapter."""
         return cls(name, _make("mask source", name, make, ("identity", "labels")))
 
     @property

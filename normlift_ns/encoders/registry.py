@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 class EncoderKind:
     """An encoder with its query defaults, as registered by an entry point of the group `normlift_ns.encoders`.
 
-    The module of an entry point should import torch only inside `make`, so that queries and error messages stay fast.
+    The module of an entry point should import torch only inside `make`, so that queries start quickly.
 
     >>> from normlift_ns.encoders.registry import encoder_kind
     >>> encoder_kind("color").negatives, encoder_kind("open_clip").rule
@@ -67,20 +67,20 @@ class EncoderKind:
     The arguments are the options, the device, the cache folder, and the identity of the encoder at the lift ({} if it
     is unknown)."""
     has_patches: Callable[[SourceOptions], bool] = lambda options: False
-    """Function that returns True if the encoder is a `DenseEncoder`, which can embed patches."""
+    """Function that returns True if the encoder can embed patches with the given options; see `DenseEncoder`."""
     has_null_words: bool = True
-    """True if the encoder can embed the words of `build.null_words`. If so, lifts without texts of their own use
-    these words as the null vocabulary."""
+    """True if the encoder can embed the words of `build.null_words`. If so, lifts without precomputed prompt
+    embeddings use these words as the null vocabulary."""
     known_words: Callable[[str], str] = str
     """Function that returns the words of a prompt that the encoder uses, or "" if the encoder ignores all of them."""
     words: Callable[[], Sequence[str]] = tuple
     """Function that returns the words that name objects in an inventory, or () if there are none."""
     suggested: tuple[float, float] = (0.4, 0.8)
-    """Range of suggested thresholds. 0 is the median relevancy, and 1 is the relevancy that 20 Gaussians exceed, or one
-    in a thousand if these are fewer."""
+    """Range of suggested thresholds, on a scale from the median relevancy (0) to the relevancy that 20 Gaussians
+    exceed, or one Gaussian in a thousand if that is fewer (1)."""
     present_from: tuple[float, float] | None = None
-    """Lower limits, for a weak match and for a match, on the cosine that one Gaussian in a thousand exceeds. None: the
-    null vocabulary, or the relevancy rule, has the limits."""
+    """Lower limits, for a weak match and for a match, on the cosine that one Gaussian in a thousand exceeds. If
+    None, the null vocabulary or the relevancy rule determines the limits."""
     learned: bool = True
     """True if a network processes the images, so that better regions improve its features."""
     pools: bool = False
@@ -88,7 +88,7 @@ class EncoderKind:
     patches."""
     is_here: Callable[[], bool] = lambda: False
     """Function that returns True if the default weights and the packages of the encoder are on this machine.
-    `--encoder auto` skips a built-in encoder if it returns False."""
+    `--encoder auto` skips a built-in encoder if the function returns False."""
     paths: tuple[str, ...] = ()
     """Names of options that can be the path of a file or folder. Runs store existing paths as absolute paths."""
 
@@ -281,8 +281,8 @@ COLOR = EncoderKind(
     learned=False,
     is_here=lambda: True,
 )
-"""Encoder with mean colors, which are compared with color names. Most shades of a color have cosines of 0.7 or more;
-most other colors have smaller cosines."""
+"""Encoder with mean colors, which are compared with color names. Most shades of a color have cosines of 0.7 or more
+with its name; most other colors have smaller cosines."""
 
 
 ENCODERS = Registry(
@@ -313,7 +313,7 @@ def _options_of_clip(options: SourceOptions) -> list[str]:
 def with_encoder(options: SourceOptions) -> SourceOptions:
     """Return the options with "auto" replaced by the preferred encoder on this machine.
 
-    The encoder is `open_clip` for LangSplat's features, which OpenCLIP computed, and if `encoder_model`,
+    The replacement is `open_clip` for LangSplat's features, which OpenCLIP computed, and if `encoder_model`,
     `encoder_pretrained` or `prompt_template` differs from its default.
     """
     if options.encoder != "auto":

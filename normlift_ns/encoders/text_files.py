@@ -35,7 +35,7 @@ class TextEncoder(Protocol):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """See `FeatureSource.identity`."""
+        """Settings that identify the encoder, as JSON-serializable values; see `FeatureSource.identity`."""
         ...
 
     def text(self, prompts: Sequence[str]) -> Float32[Tensor, "q d"]:
@@ -273,7 +273,7 @@ _MANY = 64
 
 
 def cache_path(folder: Path, identity: Mapping[str, Any], *content: bytes) -> Path:
-    """Return the cache path of a result with the given settings and content; the file may not exist."""
+    """Return the cache path of a result with the given settings and inputs; the file may not exist."""
     parts = (CACHE_FORMAT.encode(), json.dumps(identity, sort_keys=True).encode(), *content)
     key = blake2b(b"".join(xxh3_128(part).digest() for part in parts), digest_size=16).hexdigest()
     return folder / f"{key}.safetensors"
@@ -329,13 +329,13 @@ class CachedTextEncoder(LazyTextEncoder):
         return None if self.folder is None else cache_path(self.folder, self.identity, prompt.encode())
 
     def _store(self, path: Path | None, block: Float32[np.ndarray, "q d"]) -> None:
-        """Write the vectors of some prompts to the cache; do nothing if it cannot be written."""
+        """Write the vectors of prompts to the cache; do nothing if there is no cache or it is not writable."""
         if path is not None:
             with suppress(OSError):
                 save_arrays(path, {_ARRAY: block[0] if len(block) == 1 else block}, key=path.stem, overwrite=True)
 
     def _load(self, path: Path | None, count: int) -> Float32[np.ndarray, "q d"] | None:
-        """Return the cached vectors of some prompts, or None if they are missing, damaged or not unit vectors."""
+        """Return the cached vectors of `count` prompts, or None if they are missing, damaged or not unit vectors."""
         try:
             row = None if path is None or not os.path.isfile(path) else load_arrays(path, key=path.stem).arrays[_ARRAY]
         except (FileNotFoundError, ValueError, KeyError):

@@ -33,7 +33,7 @@ SAM_WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
 
 @contextmanager
 def third_party_errors(problem: str, remedy: str, error_type: type[Exception] = InputError) -> Iterator[None]:
-    """Convert exceptions of other libraries, except MemoryError, to one error with a remedy.
+    """Convert exceptions of other libraries, except MemoryError, to an error with a remedy.
 
     Args:
         problem: Start of the message.
@@ -64,7 +64,7 @@ def find_cached_model(name: str, weight_files: Sequence[str]) -> Path | None:
 
 
 def find_in_hub_cache(repository: str, *names: str) -> Path | None:
-    """Return the path of the first of `names` in the cached main revision of a hub repository, or None.
+    """Return the path of the first of `names` that exists in the cached main revision of a hub repository, or None.
 
     The function does not use the network.
     """
@@ -145,10 +145,10 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def check_not_local(name: str, parts: int, subject: str, problem: str, remedy: str) -> None:
-    """Raise an error unless a name, which is not the path of usable weights, can be a tag or a hub name.
+    """Raise an error unless a name can be a tag or a hub name. Callers have already accepted paths of usable weights.
 
     Args:
-        parts: 1 for tags, 2 for hub names, OWNER/NAME; see `is_local_path`.
+        parts: 1 for tags, 2 for hub names of the form OWNER/NAME; see `is_local_path`.
         subject: Description of the name in messages.
         problem: Description of an existing file or folder in messages.
         remedy: End of messages.
