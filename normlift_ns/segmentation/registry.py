@@ -39,7 +39,7 @@ class MaskSource:
     """
 
     make: Callable[[SourceOptions, str], Regions | FeatureSource]
-    """Function that makes the regions for options and a device such as "cuda". Weights should be loaded on first
+    """Function that creates the regions for options and a device such as "cuda". Weights should be loaded on first
     use."""
     check: Callable[[SourceOptions], None] = lambda options: None
     """Function that raises InputError or FileNotFoundError for unusable options, without importing torch."""
