@@ -1,4 +1,4 @@
-"""Triton kernels for SAM, which measure masks and compute the upscaling of its mask decoder.
+"""Triton kernels that measure SAM masks and compute the upscaling of the mask decoder.
 
 The kernels combine SAM's two bilinear resizes into one separable filter with three taps per axis. One program measures
 some rows of one mask. It keeps three interpolated rows of logits in registers until a row of the mask needs others.
@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Int32, Int64
 from torch import Tensor
 
 _ROWS = 64
-"""Number of rows per program."""
+"""Number of rows of a mask per program."""
 
 
 @triton.jit
