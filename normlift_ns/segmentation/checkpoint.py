@@ -215,7 +215,7 @@ _OTHERS = {
     "mask_decoder.hf_token": "HQ-SAM",
     "mask_decoder.compress_vit_feat": "HQ-SAM",
 }
-"""Names of other networks, by prefixes of their parameter names."""
+"""Names of networks other than the original SAM, by prefixes of their parameter names."""
 _MLP = {"0": "proj_in", "1": "layers.0", "2": "proj_out"}
 _SHARED = ("shared_image_embedding.positional_embedding", "prompt_encoder.shared_embedding.positional_embedding")
 _NAMES = {

@@ -1,7 +1,7 @@
 """Regions between learned edges, from an edge detector and the watershed hierarchy of its edge map.
 
 The detector is HED (Xie and Tu, "Holistically-Nested Edge Detection", ICCV 2015), trained on BSDS500. It is a VGG16
-with a side output after each of its five blocks, and computes an edge map from their weighted sum.
+with a side output after each of its five blocks. A weighted sum of the side outputs gives the edge map.
 
 The hierarchy is the watershed by area (Cousty and Najman, "Incremental Algorithm for Hierarchical Minimum Spanning
 Forests and Saliency of Watershed Cuts", ISMM 2011). It merges adjacent basins of the edge map in the order of the
@@ -83,7 +83,7 @@ class EdgeNetwork(nn.Module):
         return _convolve(self.fuse, torch.cat(maps, dim=1))[0, 0].sigmoid()
 
     def layers(self) -> Iterator[tuple[str, nn.Conv2d]]:
-        """Yield the convolutions with their names in Keras files."""
+        """Yield each convolution, preceded by its name in Keras files."""
         for number, (block, side) in enumerate(zip(self.blocks, self.sides), 1):
             for i, convolution in enumerate(block):
                 yield f"block{number}/layers/conv2d{f'_{i}' if i > 0 else ''}", convolution
@@ -224,7 +224,7 @@ class EdgeRegions(RegionDefaults):
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Numbers of regions of all levels."""
+        """Number of regions of each level."""
         return EDGE_COUNTS if self.count is None else (self.count,)
 
     @property

@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 from normlift_ns.segmentation.regions import column_chunks
 
 _MIN_KEPT = 3
-"""Number of masks with the highest scores that pass the score threshold if no score is above it."""
+"""Number of highest-scoring masks that pass the score threshold if no score is above it."""
 
 
 @dataclass(frozen=True)

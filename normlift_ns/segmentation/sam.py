@@ -766,7 +766,7 @@ def _distinct(
 ) -> dict[SamLevel, Int64[Tensor, " k"]]:  # fmt: skip
     """Suppress overlapping boxes within each group (non-maximum suppression).
 
-    One call handles all groups, because each NMS call waits for the GPU. An offset separates the groups.
+    One NMS call handles all groups, because each call waits for the GPU. An offset separates boxes of different groups.
 
     Returns:
         The indices to keep in each group, in descending order of scores. Equal scores keep their order.

@@ -42,7 +42,7 @@ _MASK_THRESHOLD = 0.5
 TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")
 _MAX_TOKENS = 32
 _TOGETHER = 16
-"""Maximum number of masks of the size of the image per batch."""
+"""Maximum number of image-sized masks per batch."""
 
 
 class TextMasks(NamedTuple):
