@@ -493,7 +493,7 @@ def decode_keys(
     Args:
         key: Keys of `RegionSums`.
         splat_keys: Key gaussian * views + view of every splat.
-        first: First column of every view.
+        first: First column of every view, and then the total number of columns.
         columns: Number of columns in `key`.
     """
     gaussian, column = (torch.empty(len(key), dtype=torch.int32, device=key.device) for _ in range(2))

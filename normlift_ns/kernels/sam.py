@@ -96,7 +96,7 @@ def measure_masks(
         offset: Distance of both thresholds from 0.
 
     Returns:
-        The number of pixels above the offset, the number above minus the offset, and the box of the pixels above 0.
+        The number of pixels above `offset`, the number above -`offset`, and the box of the pixels above 0.
         Boxes are (x0, y0, x1, y1), with x1 and y1 inclusive, or zeros for an empty mask.
     """
     count, height, width = len(logits), len(row_first), len(column_first)

@@ -16,7 +16,7 @@ _VECTORS = 16
 
 
 class RowNorms(NamedTuple):
-    """Norms and sums of every row j of a sparse matrix E. Its columns s have unit vectors F_s and belong to views v."""
+    """Norms and sums of the rows j of a sparse matrix E. Column s has a unit vector F_s and belongs to a view v."""
 
     total: Float64[Tensor, " n"]
     """||sum_s E_js F_s||"""

@@ -476,7 +476,7 @@ def _rows(g, box, means2d, shapes):  # pragma: no cover (compiled)
 def _blend_2d(
     g, box, means2d, transforms, opacities, shapes, transmittance, weights, limits
 ):  # pragma: no cover (compiled)
-    """Composite one Gaussian of 2D Gaussian Splatting over a tile; see `_blend`."""
+    """Composite one 2D Gaussian over a tile; see `_blend`."""
     top, left, _, _ = box
     max_alpha, min_alpha, min_transmittance = limits
     u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
@@ -518,7 +518,7 @@ def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, l
     """Composite one Gaussian over a tile. Write A_ij, or 0 if it is not drawn, to weights[row, chunk, lane].
 
     The transmittance of a pixel that has stopped is stored with a minus sign. Nine numbers in place of a conic are the
-    transform of a Gaussian of 2D Gaussian Splatting.
+    transform of a 2D Gaussian.
 
     Returns:
         The range (first, stop) of rows that the Gaussian may reach. Other rows are not written.

@@ -201,7 +201,7 @@ _LEAST_EXTENT = 1e-4
 
 
 def project_2d(world: PreparedGaussians2D, camera: Camera, settings: RasterSettings) -> ProjectedGaussians2D:
-    """Project the Gaussians of 2D Gaussian Splatting, drop invisible ones, and sort by depth (equal depths by index).
+    """Project 2D Gaussians, drop invisible ones, and sort by depth and then by index.
 
     The computation uses float64, because the extent in the image is a difference of large numbers.
 

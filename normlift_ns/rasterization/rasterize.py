@@ -49,7 +49,7 @@ class RasterJob:
 
     @property
     def is_2d(self) -> bool:
-        """True for a scene of 2D Gaussian Splatting."""
+        """True for a 2D Gaussian Splatting scene."""
         return self.scene.primitive == "2dgs"
 
     def project(self, camera: Camera) -> projection.AnyProjected:
@@ -180,7 +180,7 @@ class RasterOptions(TypedDict, total=False):
     """splatfacto's `rasterize_mode` in the training of the scene (default: classic)."""
     weight_power: int
     """Exponent of the summed A_ij (default: 1, as in the paper). The code of Splat Feature Solver uses 2. With 0, the
-    sum is the number of pixels that a Gaussian contributes to."""
+    sum is the number of pixels of a region to which a Gaussian contributes."""
     settings: RasterSettings | None
     """Constants of the rasterizer (default: those of gsplat 1.4.0). See `RasterSettings.of_gsplat`."""
     dtype: torch.dtype | None
@@ -280,7 +280,8 @@ def resolve_backend(scene: GaussianScene, backend: BackendName, **options: Unpac
     """Return the name of the backend that `rasterize_evidence` would use.
 
     Raises:
-        ValueError: If the name is unknown or the backend does not support the job. The message suggests an alternative.
+        ValueError: If the name is unknown or the backend does not support the scene and options. The message
+            suggests an alternative.
     """
     return cast(BackendName, choose_backend(backend, _job(scene, **options))[0])
 
