@@ -120,8 +120,8 @@ def _project_enormous(
 def check(job: RasterJob) -> None:
     """Raise ValueError if gsplat cannot compute a job.
 
-    gsplat supports 3D Gaussians in float32 on a GPU. The installed version must have the constants of the scene, and
-    weight_power must be 1, because sums of other powers are not gradients.
+    This backend supports 3D Gaussians in float32 on a GPU. The installed version must have the constants of the
+    scene, and weight_power must be 1, because sums of other powers are not gradients.
     """
     check_gpu("gsplat", job)
     if job.weight_power != 1:

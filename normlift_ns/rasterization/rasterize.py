@@ -630,7 +630,7 @@ def ray_weights(
 
     Args:
         scene: N Gaussians.
-        origin: Start of the ray in world units. Gaussians behind it are not hit.
+        origin: Start of the ray in world units. The ray misses Gaussians whose maximum lies behind it.
         direction: Direction of the ray, of any length > 0.
     """
     out = scene.means.new_zeros(len(scene))

@@ -603,8 +603,8 @@ class SamMasks(RegionDefaults):
     The network segments one image at a time, while another thread processes the label maps of the previous image.
 
     Raises:
-        ValueError: If transformers is not installed, torch or transformers is too old, or the checkpoint is neither a
-            path nor a hub name or belongs to another network.
+        ValueError: If torch or transformers is missing or too old, or the checkpoint is invalid or belongs to another
+            network.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 

@@ -160,8 +160,8 @@ class Sam3Masks(RegionDefaults):
     If instances overlap, the lift uses the one with the higher score. Pixels without an instance are unlabeled.
 
     Raises:
-        ValueError: If transformers is not installed, torch or transformers is too old, or the checkpoint is neither a
-            path nor a hub name or belongs to another network.
+        ValueError: If torch or transformers is missing or too old, or the checkpoint is invalid or belongs to another
+            network.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 
