@@ -1,4 +1,4 @@
-"""Triton kernels for compositing, which list splats by cell, sum weights by region, and render any number of channels.
+"""Triton compositing kernels that list splats by cell, sum weights by region, and render any number of channels.
 
 A cell is one of gsplat's tiles or a part of one. The list of a cell contains the splats whose rectangle touches the
 tile, as in gsplat. Culling removes the splats whose alpha cannot reach its threshold in the cell. This test uses
@@ -31,13 +31,13 @@ _REACH_MARGIN = tl.constexpr(1e-3)
 It covers the rounding of the exponential in gsplat and of the float64 computation here.
 """
 _NEEDLE = tl.constexpr(1e-6)
-"""Smallest ratio of the determinant of a conic to the product of its diagonal entries for which a splat is culled.
+"""Ratio of the determinant of a conic to the product of its diagonal entries, above which a splat can be culled.
 
-Below this ratio, the determinant is too inaccurate.
+At smaller ratios, the determinant is too inaccurate.
 """
 _FAR = tl.constexpr(1e30)
 _SIZES = ("width", "height", "tiles_across", "tiles_down", "cells_across", "cells_down")
-"""Arguments of kernels that are compiled once for images of all sizes."""
+"""Kernel arguments that Triton does not specialize, so that a kernel is compiled once for all image sizes."""
 
 
 class CellGrid(NamedTuple):
@@ -164,7 +164,7 @@ def build_cell_lists(
         views: Number of views.
         grid: Cells of an image.
         min_alpha: Smallest alpha that is drawn.
-        cull: Omit splats from cells in which their alpha is below `min_alpha`. This does not change other entries.
+        cull: Omit splats from cells in which their alpha cannot reach `min_alpha`. The other entries stay the same.
     """
     device, entries, tile = projected.depth.device, len(projected.depth), grid.tile
     order = projected.depth.sort(stable=True).indices  # equal depths keep the order of the Gaussians
@@ -206,7 +206,7 @@ def build_cell_lists(
 
 
 UNROLL = 4
-"""Number of splats between two checks whether all pixels of a cell are finished."""
+"""Number of splats to composite between two checks for unfinished pixels in a cell."""
 _MOST_SLOTS = 2**26
 """Largest number of slots in a chunk, apart from those of its first cell. A slot holds one sum and its key, and takes
 8 or 12 bytes."""
@@ -225,7 +225,7 @@ class AlphaLimits(NamedTuple):
 
 
 class RegionSums(NamedTuple):
-    """Nonzero sums for every cell, splat and region, ordered by cell. A key can occur in several cells."""
+    """Positive sums for every cell, splat and region, ordered by cell. A key can occur in several cells."""
 
     key: Int[Tensor, " m"]
     """Keys row * columns + label + 1. The row is that of the splat in `ProjectedSplats`."""
@@ -458,7 +458,7 @@ def sum_regions(
 def _chunks(slots: Int[Tensor, " cells_plus_1"]) -> list[tuple[int, int, int, int]]:
     """Return ranges (first cell, last cell, first slot, last slot), with exclusive ends.
 
-    The cells of a range after the first one have at most _MOST_SLOTS slots together.
+    Without its first cell, a range has at most `_MOST_SLOTS` slots.
     """
     total = int(slots[-1])
     if total <= _MOST_SLOTS:
@@ -492,8 +492,8 @@ def decode_keys(
 
     Args:
         key: Keys of `RegionSums`.
-        splat_keys: Keys gaussian * views + view of every splat.
-        first: First column of every view.
+        splat_keys: Key gaussian * views + view of every splat.
+        first: First column of every view, and then the total number of columns.
         columns: Number of columns in `key`.
     """
     gaussian, column = (torch.empty(len(key), dtype=torch.int32, device=key.device) for _ in range(2))

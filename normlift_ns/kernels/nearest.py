@@ -3,7 +3,7 @@
 A warp searches for the neighbors of all points of a leaf together. It visits the tree from this leaf outward, and skips
 a subtree if its box is farther than the worst candidate of every point. It keeps a few more candidates than requested,
 by float32 distance, and finally ranks them by float64 distance and index. If a dropped point could be as near as the
-last neighbor, the neighbors of the point are marked as uncertain.
+last neighbor of a query point, the neighbors of the query point are marked as uncertain.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ the two points another 24."""
 _SORTED_IN_A_BLOCK = 4096
 """Largest number of points that torch sorts within one GPU block, without passes over memory."""
 _LEAVES = 2**14
-"""Number of leaves per launch, with half a million points. The candidates of a point take 320 bytes for K = 36."""
+"""Maximum number of leaves per launch (half a million points). The candidates of a point take 320 bytes for K = 36."""
 
 
 class GatheringProcesses(Protocol):
@@ -145,9 +145,10 @@ def _ascending_bits(x: Tensor) -> Tensor:
 def _search(
     points, boxes, index, candidates, query_leaves, leaves, stride, wanted, LEAF: tl.constexpr, SLOTS: tl.constexpr
 ):
-    """Write the `wanted` nearest points of each point of a leaf to candidates[slot, point].
+    """Write the `wanted` nearest points of each point of a leaf to candidates[i, point], in any order.
 
-    A candidate is an int64. Its high half is the squared distance as float32, and its low half the slot of the point.
+    A candidate is an int64. Its high half is the squared distance as float32. Its low half is the position of the
+    candidate in `KdTree.points`.
     """
     leaf = tl.load(query_leaves + tl.program_id(0))
     lane = tl.arange(0, LEAF)
@@ -297,7 +298,7 @@ def find_nearest(
 def brute_force_nearest(points: Float32[Tensor, "n 3"], rows: Int64[Tensor, " r"], k: int) -> NearestNeighbors:
     """Return the K nearest other points of some points by computing all distances.
 
-    This function serves the uncertain rows of `find_nearest`.
+    Use it for the uncertain rows of `find_nearest`.
     """
     exact, parts = points.double(), []
     n = len(points)

@@ -1,9 +1,9 @@
-"""Projection of Gaussians into cameras as in gsplat, with one thread per Gaussian.
+"""Projection of Gaussians into cameras as in gsplat, with one thread per Gaussian or visible splat.
 
 The arithmetic is that of gsplat 1.4.0's fully_fused_projection_fwd.cu as nvcc 13.0 compiles it for sm_90 with gsplat's
 flags (-O3 --use_fast_math). The code rounds and fuses the same products as that machine code. Other fused
 operations are disabled. Divisions, square roots and reciprocals are the approximate versions of both compilers. All
-numbers are therefore equal bit for bit, except numbers below 2 ** -126.
+numbers are therefore equal bit for bit, except those with a magnitude below 2 ** -126.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class ProjectedSplats(NamedTuple):
 
 @triton.jit
 def camera_axis(camera, axis: tl.constexpr, x, y, z):
-    """Return one camera coordinate, rounded as CUDA rounds R p + t."""
+    """Return one camera coordinate of the points (x, y, z), rounded as CUDA rounds R p + t."""
     a, b = tl.load(camera + 4 * axis), tl.load(camera + 4 * axis + 1)
     c, t = tl.load(camera + 4 * axis + 2), tl.load(camera + 4 * axis + 3)
     return tl.fma(z, c, tl.fma(x, a, b * y)) + t

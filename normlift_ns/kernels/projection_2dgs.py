@@ -1,7 +1,7 @@
-"""gsplat's projection of the flat Gaussians of 2D Gaussian Splatting, one thread per Gaussian and camera.
+"""gsplat's projection of the flat Gaussians of 2D Gaussian Splatting, with one thread per Gaussian and camera.
 
-The arithmetic is that of gsplat 1.4.0's fully_fused_projection_2dgs_fwd.cu as nvcc 13.0 compiles it for sm_90, in the
-same way as in `kernels.projection`.
+The arithmetic is that of gsplat 1.4.0's fully_fused_projection_2dgs_fwd.cu as nvcc 13.0 compiles it for sm_90; see
+`kernels.projection`.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from torch import Tensor
 from normlift_ns.kernels.projection import CAMERA, ProjectedSplats, camera_axis, dot
 
 SPLAT_2D = 16
-"""Number of values per splat, read as seven pairs and padded with two zeros. The first values are the center u, v in
-pixels, the first row of the transform and the opacity. Half width and half height of the square and the other two rows
-of the transform follow. See `rasterization.projection.ProjectedGaussians2D`.
+"""Number of values per splat: seven pairs, and two zeros as padding. The first values are the center u, v in pixels,
+the first row of the transform and the opacity. The half width and half height of the square and the other two rows of
+the transform follow. See `rasterization.projection.ProjectedGaussians2D`.
 """
 _BLOCK = 128
 _LEAST_EXTENT = tl.constexpr(1e-4)
-"""Lower bound for the squared half side of an ellipse of one standard deviation, in square pixels."""
+"""Lower bound on the squared half extent of an ellipse of one standard deviation, in square pixels."""
 _LARGEST_RADIUS = tl.constexpr(2147483648.0)
 
 
 class Settings2D(NamedTuple):
-    """Fields of the rasterizer's settings that the projection uses."""
+    """Fields of `RasterSettings` that the projection uses."""
 
     near_plane: float
     far_plane: float
@@ -38,7 +38,7 @@ class Settings2D(NamedTuple):
 
 @triton.jit
 def _world_axes(quats, scales, i, valid):
-    """Return the columns x and y of the rotation matrix and the first two scales."""
+    """Return the first two columns of the rotation matrix and the first two scales."""
     w = tl.load(quats + 4 * i, mask=valid, other=1.0)
     x = tl.load(quats + 4 * i + 1, mask=valid, other=0.0)
     y = tl.load(quats + 4 * i + 2, mask=valid, other=0.0)
@@ -65,7 +65,7 @@ def _rotated(camera, axis: tl.constexpr, ax, ay, az, bx, by, bz):
 
 @triton.jit
 def _along_axis(last_a, last_b, last_c, a, b, c, inverse):
-    """Return the center and the squared half side of the projected ellipse along one axis of the image."""
+    """Return the center and the squared half extent of the projected ellipse along one axis of the image."""
     scaled_a, scaled_b, scaled_c = a * inverse, b * inverse, -(c * inverse)
     center = tl.fma(last_c, scaled_c, tl.fma(last_a, scaled_a, last_b * scaled_b))
     square = tl.fma(c, scaled_c, tl.fma(a, scaled_a, b * scaled_b))
@@ -145,7 +145,7 @@ def project_gaussians_2d(
     height: int,
     rules: Settings2D,
 ) -> ProjectedSplats:
-    """Project a scene of 2D Gaussian Splatting into cameras of one size. Invisible Gaussians take one byte per view.
+    """Project a 2D Gaussian Splatting scene into cameras of one size. Invisible Gaussians take one byte per view.
 
     Args:
         means: Centers of the Gaussians in world coordinates.
@@ -153,7 +153,7 @@ def project_gaussians_2d(
         scales: Standard deviations in world units; the third one is not used.
         opacities: Opacities in 0..1.
         drawable: Mask of the Gaussians to project.
-        cameras: Values described at `CAMERA`.
+        cameras: Values of every camera, as described at `CAMERA`.
         width: Width of the images in pixels.
         height: Height of the images in pixels.
         rules: Constants of the projection.

@@ -1,4 +1,4 @@
-"""Triton kernels for SAM, which measure masks and compute the upscaling of its mask decoder.
+"""Triton kernels that measure SAM masks and compute the upscaling of the mask decoder.
 
 The kernels combine SAM's two bilinear resizes into one separable filter with three taps per axis. One program measures
 some rows of one mask. It keeps three interpolated rows of logits in registers until a row of the mask needs others.
@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Int32, Int64
 from torch import Tensor
 
 _ROWS = 64
-"""Number of rows per program."""
+"""Number of rows of a mask per program."""
 
 
 @triton.jit
@@ -96,7 +96,7 @@ def measure_masks(
         offset: Distance of both thresholds from 0.
 
     Returns:
-        The number of pixels above the offset, the number above minus the offset, and the box of the pixels above 0.
+        The number of pixels above `offset`, the number above -`offset`, and the box of the pixels above 0.
         Boxes are (x0, y0, x1, y1), with x1 and y1 inclusive, or zeros for an empty mask.
     """
     count, height, width = len(logits), len(row_first), len(column_first)

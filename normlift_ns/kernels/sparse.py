@@ -16,7 +16,7 @@ _VECTORS = 16
 
 
 class RowNorms(NamedTuple):
-    """Norms and sums of every row j of a sparse matrix E, for unit rows F_s of its columns s in views v."""
+    """Norms and sums of the rows j of a sparse matrix E. Column s has a unit vector F_s and belongs to a view v."""
 
     total: Float64[Tensor, " n"]
     """||sum_s E_js F_s||"""
@@ -120,7 +120,7 @@ def _norms_of_row(
     offsets, column, weight, column_view, table, out_total, out_by_view, out_weight, out_squared, out_views,
     j, dimension, min_share, max_entries, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Compute one row. Repeat a sum in float64 if its terms nearly cancel or are many."""
+    """Compute the norms of one row. Repeat a sum in float64 if it has many terms or they nearly cancel."""
     start, stop = tl.load(offsets + j), tl.load(offsets + j + 1)
     if stop - start <= 1:  # no vector sum is needed, because rows of the table are unit vectors
         only = tl.load(weight + start, mask=start < stop, other=0.0).to(tl.float64)
@@ -182,7 +182,7 @@ def row_norms(
     min_share: float,
     max_entries: int,
 ) -> RowNorms:
-    """Return the norms that the lift needs, in one pass over E and without an [N, D] array.
+    """Return the norms and sums of all rows of E, without an [N, D] array.
 
     Args:
         offsets: Row offsets of the sparse matrix E.

@@ -1,15 +1,16 @@
-"""Triton kernel of the vote, with one Gaussian per program and a small matrix product for the cosines of its neighbors.
+"""Triton kernel for the vote of `core.refine`, with one Gaussian per program.
 
-Float32 rows u with D components are split into u = h + l, two float16 numbers with 11 significant bits each. The vote
-uses the sigmoid g = 1 / (1 + exp(-(cosine - tau) / gamma)). Three products at the fastest rate of tensor cores,
-h h + h l + l h, give cosines with 22 bits. Most votes need only the first product.
+A small matrix product computes the cosines between the Gaussian and its neighbors. Float32 rows u with D components
+are split into u = h + l, two float16 numbers with 11 significant bits each. The vote uses the sigmoid
+g = 1 / (1 + exp(-(cosine - tau) / gamma)). Three products at the fastest rate of tensor cores, h h + h l + l h, give
+cosines with 22 bits. Most votes need only the first product.
 
 Let e be the largest |l| of a Gaussian and its neighbors. Assume that all products and sums are exact except for
 rounding errors of 2**-23 relative to values of at most 1. Then |<h_j, h_k> - <u_j, u_k>| <= t with
 t = 2.02 e + (D + 16) 2**-23. The derivative of log(g (1 - g)) with respect to the cosine is at most 1 / gamma. Let
 f = exp(t / gamma) - 1. An error t of the cosine then changes a sigmoid g by at most f g (1 - g). Let A be the
 weighted sum of g, and W the sum of the weights. By Jensen's inequality, the error of A is at most f A (1 - A / W).
-The rounding of sums adds at most 3e-5. If these error intervals determine the winner, the vote is finished.
+The rounding of sums adds at most 3e-5. If the resulting error intervals determine the winner, the vote is finished.
 Otherwise, the kernel adds the other products and compares again.
 """
 
@@ -38,7 +39,7 @@ class LaunchConfig(NamedTuple):
     """Number of pipeline stages of the loads."""
     warps: int
     registers: int | None = None
-    """Largest number of registers per thread. With fewer registers, more programs run simultaneously."""
+    """Maximum number of registers per thread, or None for no limit. A low limit lets more programs run in parallel."""
 
 
 _HALVES = LaunchConfig(columns=64, columns_later=32, stages=3, warps=4, registers=128)
@@ -57,7 +58,7 @@ def _winner(score, member, slot, valid, i, delta):
 
 @triton.jit
 def _certain(agreed, r, weight, slot, valid, spread, delta):
-    """Return True if the winner is the same for all scores in their error intervals (see above); False for NaN."""
+    """Return True if the winner is the same for all scores in their error intervals; False for NaN."""
     share = agreed / tl.sum(weight, axis=0)  # A / W
     score = r * agreed
     error = score * (spread * (tl.maximum(1 - share, 0.0) + 1e-5) + 3e-5)
@@ -150,7 +151,7 @@ def _halve(rows, high, low, rough, dimension, BLOCK: tl.constexpr):
 def split_float16(
     rows: Float32[Tensor, "m d"],
 ) -> tuple[Float16[Tensor, "m d"], Float16[Tensor, "m d"], Float32[Tensor, " m"]]:
-    """Return h, 2048 l and |l| of unit rows u = h + l. |l| is inf for rows with a squared length of 1.01 or more."""
+    """Return h, 2048 l and a bound on |l| for unit rows u = h + l. The bound is inf if |u| ** 2 is 1.01 or more."""
     high, low = (torch.empty_like(rows, dtype=torch.float16) for _ in range(2))
     rough = torch.empty(len(rows), device=rows.device)
     if len(rows) > 0:
@@ -180,13 +181,13 @@ def vote(
     """Write to `source` the index of the Gaussian whose direction each voter takes, by the formulas of `core.refine`.
 
     Args:
-        voters: Gaussians to refine. Neighbors in space should be close in this list, because they read the same rows.
+        voters: Gaussians to refine. Spatial neighbors should be close in this list, because they read the same rows.
         neighbors: Neighbors of every Gaussian, nearest first, padded with -1. K is at most MAX_VOTE_NEIGHBORS.
         distance: Distances of the neighbors.
-        directions: Unit rows or 0. Tensor cores multiply them and sum in float32.
+        directions: Unit or zero rows. Tensor cores multiply them and sum in float32.
         row_of: Row of every Gaussian's direction, valid for the voters and their neighbors.
         reliability: Reliability of every Gaussian.
-        source: Output. Entries of other Gaussians are not changed.
+        source: Output. Entries of other Gaussians, and of voters without a reliable neighbor, are not changed.
         tau: Threshold of the sigmoid.
         gamma: Width of the sigmoid.
         width: sigma_d, in the units of `distance`.

@@ -30,8 +30,8 @@ _CHANNELS = 32
 _COMPILED = ("frustum_margin", "min_compensation", "max_alpha", "min_alpha", "min_transmittance")
 """Constants of gsplat's compiled code that must equal those of the scene."""
 _EXTENT = ("per_axis", "radius_sigmas", "min_discriminant")
-"""Further constants of the compiled code, which usually must equal those of the scene too. They may differ if a later
-version than gsplat 1.4 is installed and the scene needs the squares of 1.4, because `_squares` computes the squares."""
+"""Further constants of the compiled code, which must usually equal those of the scene. They may differ if the scene
+needs the squares of gsplat 1.4 and a later version is installed, because `_squares` then computes the squares."""
 _LARGE = 100.0
 """Scale in world units below which no determinant overflows, for focal lengths below 400,000 pixels."""
 _OVERFLOWS = 1e10
@@ -120,8 +120,8 @@ def _project_enormous(
 def check(job: RasterJob) -> None:
     """Raise ValueError if gsplat cannot compute a job.
 
-    It needs 3D Gaussians in float32 on a GPU, and an installed version with the constants of the scene. It also needs
-    weight_power 1, because sums of other powers are not gradients.
+    This backend supports 3D Gaussians in float32 on a GPU. The installed version must have the constants of the
+    scene, and weight_power must be 1, because sums of other powers are not gradients.
     """
     check_gpu("gsplat", job)
     if job.weight_power != 1:
@@ -185,12 +185,12 @@ def resolve_gsplat_rules(rules: str, recorded: str | None) -> str:
 
 
 def in_flight(job: RasterJob, camera: Camera) -> int:
-    """Return 1, because gsplat's lists of a view take 60 bytes per Gaussian."""
+    """Return 1, to save memory: gsplat's lists of a view take 60 bytes per Gaussian."""
     return 1
 
 
 def views_evidence(job: RasterJob, batch: RasterBatch) -> Entries:
-    """Return the entries of views, computed with gsplat's forward and backward pass."""
+    """Return the entries of views, computed with gsplat's forward and backward passes."""
     parts, before = [], 0
     for camera, label_map, count in zip(*batch):
         for first, gradient in _gradients(job, camera, label_map, count):

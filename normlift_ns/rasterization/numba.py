@@ -113,8 +113,8 @@ def _bounding_ellipses(projected: ProjectedGaussians2D, min_alpha: float) -> Flo
     """Return ellipses around `means2d` that contain every pixel with alpha >= min_alpha, as conics in 1 / pixels^2.
 
     Let r ** 2 = 2 log(opacity / min_alpha). Such a pixel lies in the projected ellipse of r standard deviations or in a
-    disc with a radius of r / sqrt(2) pixels. The ellipse contains the offsets x with x^T C x <= r ** 2, for its conic
-    C. A conic is zero if the projection is not an ellipse.
+    disc with a radius of r / sqrt(2) pixels. The returned ellipse with conic C contains the offsets x with
+    x^T C x <= r ** 2. A conic is zero if the projection is not an ellipse.
     """
     transforms, means = projected.transforms.double(), projected.means2d.double()
     square = (2 * (projected.opacities.double() / min_alpha).log()).clamp(min=0)
@@ -206,7 +206,7 @@ def exp(x: float) -> float:
 
 @overload(exp, jit_options={"error_model": "numpy", "fastmath": {"contract"}})
 def _compiled_exp(x):  # pragma: no cover (compiled)
-    """Compute e ** x = 2 ** n e ** r with |r| <= ln(2) / 2, by the expf polynomial of Cephes or a Taylor series."""
+    """Return a function for e ** x = 2 ** n e ** r, |r| <= ln(2) / 2, by the Cephes polynomial or a Taylor series."""
 
     def single(x):
         x = x if x > _LEAST32 else _LEAST32
@@ -254,7 +254,7 @@ _ROUNDINGS = 4
 def _axis(reach, own, mixed, other):  # pragma: no cover (compiled)
     """Return the parameters for `ellipse_extent`. The ellipse is own s^2 + 2 mixed s t + other t^2 <= reach.
 
-    The extent is infinite if rounding makes the ellipse degenerate.
+    The extent is infinite if `reach` is infinite or rounding makes the ellipse degenerate.
     """
     det = own * other - mixed * mixed
     if own > 0 and other > 0 and det > 0 and reach < np.inf:
@@ -287,7 +287,7 @@ def _touched_tiles(center, radius, size, count):  # pragma: no cover (compiled)
 
 @kernel
 def _shape(g, means2d, conics, opacities, radii, width, height, size, min_alpha, eps):  # pragma: no cover (compiled)
-    """Return the ellipse in which alpha can reach min_alpha, as `_axis` of x, `_axis` of y and half its height.
+    """Return the ellipse in which alpha can reach min_alpha, as `_axis` of x, `_axis` of y and half of its height.
 
     The height is negative if alpha is below min_alpha everywhere.
     """
@@ -476,7 +476,7 @@ def _rows(g, box, means2d, shapes):  # pragma: no cover (compiled)
 def _blend_2d(
     g, box, means2d, transforms, opacities, shapes, transmittance, weights, limits
 ):  # pragma: no cover (compiled)
-    """Composite one Gaussian of 2D Gaussian Splatting over a tile; see `_blend`."""
+    """Composite one 2D Gaussian over a tile; see `_blend`."""
     top, left, _, _ = box
     max_alpha, min_alpha, min_transmittance = limits
     u, v, opacity = means2d[g, 0], means2d[g, 1], opacities[g]
@@ -518,7 +518,7 @@ def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, l
     """Composite one Gaussian over a tile. Write A_ij, or 0 if it is not drawn, to weights[row, chunk, lane].
 
     The transmittance of a pixel that has stopped is stored with a minus sign. Nine numbers in place of a conic are the
-    transform of a Gaussian of 2D Gaussian Splatting.
+    transform of a 2D Gaussian.
 
     Returns:
         The range (first, stop) of rows that the Gaussian may reach. Other rows are not written.
@@ -554,7 +554,7 @@ def _blend(g, box, means2d, conics, opacities, shapes, transmittance, weights, l
 
 @kernel
 def _label_span(ranges, first, stop):  # pragma: no cover (compiled)
-    """Return the smallest label number in the rows `first` to `stop` - 1, and the largest one plus 1."""
+    """Return the smallest label number in rows first..stop - 1 of a tile, and the largest one plus 1."""
     least, greatest = ranges[first, 0], ranges[first, 1]
     for row in range(first + 1, stop):
         least, greatest = min(least, ranges[row, 0]), max(greatest, ranges[row, 1])
@@ -563,7 +563,7 @@ def _label_span(ranges, first, stop):  # pragma: no cover (compiled)
 
 @kernel
 def _sum_by_lane(weights, local, number, first, stop, power, lanes):  # pragma: no cover (compiled)
-    """Return the sum of A_ij ** power over the pixels with one label in some rows. `lanes` is a buffer of zeros."""
+    """Sum A_ij ** power over the pixels of label `number` in rows first..stop - 1. `lanes` is a buffer of zeros."""
     for row in range(first, stop):
         for chunk in range(weights.shape[1]):
             if power == 1:
@@ -584,7 +584,7 @@ def _sum_by_lane(weights, local, number, first, stop, power, lanes):  # pragma: 
 
 @kernel
 def _sum_by_pixel(weights, local, first, stop, power, sums):  # pragma: no cover (compiled)
-    """Add A_ij ** power of the pixels in some rows to sums[number], for all labels."""
+    """Add A_ij ** power of each pixel in rows first..stop - 1 to the sum of its label, sums[number]."""
     for row in range(first, stop):
         for chunk in range(weights.shape[1]):
             for lane in range(LANES):

@@ -1,4 +1,4 @@
-"""Projection of Gaussians and tile lists as in gsplat, and the reference rasterizer in torch.
+"""Projection and tile lists of Gaussians as in gsplat, and the reference rasterizer in torch.
 
 The gsplat sources are utils.cuh and isect_tiles.cu.
 """
@@ -55,26 +55,26 @@ class ProjectedGaussians(NamedTuple):
 
 
 class PreparedGaussians2D(NamedTuple):
-    """The drawable Gaussians of a scene of 2D Gaussian Splatting, prepared for any camera."""
+    """The drawable Gaussians of a 2D Gaussian Splatting scene, prepared for any camera."""
 
     gaussian: Int64[Tensor, " m"]
     """Indices of the Gaussians in the scene."""
     means: Float[Tensor, "m 3"]
     """Centers in the precision of the scene, because rounding would change the drawing order."""
     axes: Float64[Tensor, "m 3 2"]
-    """The two axes in the plane of each Gaussian, as long as its standard deviations."""
+    """The two axes in the plane of each Gaussian, scaled by the standard deviations along them."""
     opacities: Float[Tensor, " m"]
 
 
 class ProjectedGaussians2D(NamedTuple):
-    """The Gaussians of 2D Gaussian Splatting visible in a camera, nearest first."""
+    """Visible 2D Gaussians of one camera, nearest first."""
 
     gaussian: Int64[Tensor, " m"]
     """Indices of the Gaussians in the scene."""
     means2d: Float[Tensor, "m 2"]
     """Centers of the projected ellipses of one standard deviation."""
     transforms: Float[Tensor, "m 3 3"]
-    """Matrices from (a, b, 1), with a and b in standard deviations along the axes, to homogeneous pixels."""
+    """Matrices from (a, b, 1), with a and b in standard deviations along the axes, to homogeneous pixel coordinates."""
     opacities: Float[Tensor, " m"]
     radii: Float[Tensor, "m 2"]
     """Half width and half height of the square that selects the tiles, in whole pixels."""
@@ -197,11 +197,11 @@ def project(
 
 
 _LEAST_EXTENT = 1e-4
-"""Lower bound for the squared half side of a projected ellipse of one standard deviation, in square pixels."""
+"""Lower bound on the squared half extent of a projected ellipse of one standard deviation, in square pixels."""
 
 
 def project_2d(world: PreparedGaussians2D, camera: Camera, settings: RasterSettings) -> ProjectedGaussians2D:
-    """Project the Gaussians of 2D Gaussian Splatting, drop invisible ones, and sort by depth (equal depths by index).
+    """Project 2D Gaussians, drop invisible ones, and sort by depth and then by index.
 
     The computation uses float64, because the extent in the image is a difference of large numbers.
 
@@ -233,7 +233,7 @@ def project_2d(world: PreparedGaussians2D, camera: Camera, settings: RasterSetti
 
 
 def _between_planes(world: AnyPrepared, camera: Camera, settings: RasterSettings) -> Int64[Tensor, " m"]:
-    """Return the Gaussians with centers between the near and the far plane, nearest first."""
+    """Return the rows of `world` with centers between the near and the far plane, nearest first."""
     depth = camera_depths(world.means, camera)
     near = ((depth >= settings.near_plane) & (depth <= settings.far_plane)).nonzero().squeeze(1)
     return near[torch.argsort(depth[near], stable=True)]

@@ -49,7 +49,7 @@ class RasterJob:
 
     @property
     def is_2d(self) -> bool:
-        """True for a scene of 2D Gaussian Splatting."""
+        """True for a 2D Gaussian Splatting scene."""
         return self.scene.primitive == "2dgs"
 
     def project(self, camera: Camera) -> projection.AnyProjected:
@@ -129,7 +129,7 @@ def _with_tiles(job: RasterJob, camera: Camera) -> tuple[projection.AnyProjected
 
 
 def choose_backend(name: str, job: RasterJob) -> tuple[str, Backend]:
-    """Return the name of a backend and the backend.
+    """Choose a backend, and return its name and the backend itself.
 
     "auto" selects the fastest backend for the device, the precision, the kind of Gaussians and the weight power.
 
@@ -180,7 +180,7 @@ class RasterOptions(TypedDict, total=False):
     """splatfacto's `rasterize_mode` in the training of the scene (default: classic)."""
     weight_power: int
     """Exponent of the summed A_ij (default: 1, as in the paper). The code of Splat Feature Solver uses 2. With 0, the
-    sum is the number of pixels that a Gaussian contributes to."""
+    sum is the number of pixels of a region to which a Gaussian contributes."""
     settings: RasterSettings | None
     """Constants of the rasterizer (default: those of gsplat 1.4.0). See `RasterSettings.of_gsplat`."""
     dtype: torch.dtype | None
@@ -213,10 +213,10 @@ def rasterize_evidence(
             -2 means masked, and `lift` always ignores such pixels.
         num_regions: Number of regions per view (default: largest id + 1). Required if the feature table has rows for
             regions above the largest id.
-        backend: "torch" is the reference for any device and precision. "numba" is compiled for the CPU. "triton" is
-            fast, for float32 on a GPU. "gsplat" is stock gsplat, for 3D Gaussians in float32 on a GPU, weight_power 1
-            and constants that the installed version supports. "auto" selects the fastest backend for the device, the
-            precision, the kind of Gaussians and the weight power.
+        backend: "torch" is the reference for any device and precision. "numba" is compiled for the CPU. "triton" has
+            its own kernels for float32 on a GPU. "gsplat" is stock gsplat, for 3D Gaussians in float32 on a GPU,
+            weight_power 1 and constants that the installed version supports. "auto" selects the fastest backend for the
+            device, the precision, the kind of Gaussians and the weight power.
         progress: Callback after every view, with the number of finished views and the number of all views, or None if
             the latter is unknown.
         options: Keyword arguments of `RasterOptions`.
@@ -280,7 +280,8 @@ def resolve_backend(scene: GaussianScene, backend: BackendName, **options: Unpac
     """Return the name of the backend that `rasterize_evidence` would use.
 
     Raises:
-        ValueError: If the name is unknown or the backend does not support the job. The message suggests an alternative.
+        ValueError: If the name is unknown or the backend does not support the scene and options. The message
+            suggests an alternative.
     """
     return cast(BackendName, choose_backend(backend, _job(scene, **options))[0])
 
@@ -337,7 +338,7 @@ def render_views(
     settings: RasterSettings | None = None,
     dtype: torch.dtype | None = None,
 ) -> Iterator[tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]]:
-    """Yield what `render` returns for each of several cameras; the Gaussians are prepared once."""
+    """Yield the result of `render` for each camera. The Gaussians are prepared only once."""
     if len(values) != len(scene):
         raise InputError(f"values must have shape [{len(scene)}, C], one row per Gaussian, got {tuple(values.shape)}")
     job = _job(scene, rasterize_mode, settings, dtype)
@@ -508,8 +509,8 @@ def contributors(
     """Return the Gaussians that contribute to pixels, with their compositing weights A_pj (eq. 1 of the paper).
 
     The weights are exact, because each pixel is rasterized as a region. The sum of A_pj over the pixels of a region is
-    therefore its evidence for weight_power 1. The sum over j of A_pj times the values of the Gaussians is the result of
-    `render`.
+    therefore the evidence E_js of `rasterize_evidence` with weight_power 1. The sum over j of A_pj times the values of
+    the Gaussians is the result of `render`.
 
     Args:
         scene: N Gaussians. Gaussians with invalid parameters (see `GaussianScene.drawable`) do not contribute.
@@ -629,7 +630,7 @@ def ray_weights(
 
     Args:
         scene: N Gaussians.
-        origin: Start of the ray in world units. The ray does not hit Gaussians behind it.
+        origin: Start of the ray in world units. The ray misses Gaussians whose maximum lies behind it.
         direction: Direction of the ray, of any length > 0.
     """
     out = scene.means.new_zeros(len(scene))

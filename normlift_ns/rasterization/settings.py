@@ -52,7 +52,7 @@ class RasterSettings:
     radius_sigmas: float = 3.0
     """Half side of the square, or largest half side of the rectangle, in standard deviations."""
     tile_size: int = 16
-    """Side of a tile in pixels. Gaussians are drawn only in the tiles that their shape touches."""
+    """Side of a tile in pixels. Gaussians are drawn only in the tiles that their square or rectangle touches."""
     max_alpha: float = 0.999
     """Upper bound of alpha."""
     min_alpha: float = 1 / 255

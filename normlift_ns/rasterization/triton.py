@@ -25,7 +25,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 CELL, SMALL_CELL = (16, 16), (16, 8)
 """Largest width and height of cells in pixels, for fewer than `_MANY` Gaussians, and for `_MANY` or more.
 
-With many Gaussians, smaller cells are faster, because the pixels of a cell have fewer Gaussians in common.
+With many Gaussians, smaller cells are faster, because the pixels of a cell share fewer Gaussians.
 """
 _MANY = 4_000_000
 """Smallest number of Gaussians for which `SMALL_CELL` is used."""
@@ -37,7 +37,7 @@ A view takes one byte per Gaussian and 120 bytes per visible Gaussian.
 _SAMPLE = 4096
 """Number of Gaussians that `kernel_calls` projects."""
 _SHORT = 2**15
-"""Number of cells below which int16 can index the cells of a batch. Sorting int16 takes half the time of int32."""
+"""Number of cells in a batch below which int16 can index them. Sorting int16 takes half as long as sorting int32."""
 
 
 def check(job: RasterJob) -> None:
@@ -129,10 +129,10 @@ def kernel_calls(
     scene: GaussianScene, camera: Camera, *, rasterize_mode: RasterizeMode, settings: RasterSettings,
     dtype: torch.dtype, weight_power: int, **_: Any,
 ) -> tuple[list[Callable[[], Any]], list[Callable[[], Any]]]:  # fmt: skip
-    """Return calls that each compile some kernels of this backend, with one splat or some Gaussians of a scene.
+    """Return functions that compile the kernels of this backend, by running them on a splat or a part of the scene.
 
     Returns:
-        Calls for the kernels of `composite`, and for the other kernels of `views_evidence`.
+        Functions for the kernels of `composite`, and for the other kernels of `views_evidence`.
     """
     job = RasterJob(scene, rasterize_mode == "antialiased", settings, dtype, weight_power)
     grid, device, limits = _grid(job, camera), scene.means.device, _limits(settings)

@@ -27,7 +27,7 @@ from normlift_ns.options import DEFAULT_SAM, DEFAULT_SAM3, SamPrecision
 
 WEIGHTS_FILE = SAM_WEIGHT_FILES[0]
 _MAX_PARTS, _MAX_SIZE, _MAX_DEPTH = 512, 2**16, 8
-"""Upper bounds on numbers of layers, labels and entries, on all other numbers of a config, and on its nesting depth."""
+"""Upper bounds on the numbers of layers, labels and entries in a config, on its other numbers, and on its nesting."""
 _MIN_TORCH = "2.6"
 _ALTERNATIVE = "lift with the original SAM: --regions sam --sam-model sam_vit_h_4b8939.pth (a file published by Meta)"
 _SAM3_ALTERNATIVE = "lift with other --regions, or query without --segment"
@@ -46,13 +46,13 @@ class SamFamily:
     prefix: str
     """Prefix of the class names of the network in transformers."""
     config_parts: tuple[str, ...]
-    """Names of the configs that the config of the network contains."""
+    """Names of the sub-configs in the config of the network."""
     nested_types: tuple[tuple[str, str], ...] = ()
-    """Dotted paths of more deeply nested configs, each with its required model type."""
+    """Dotted paths of sub-configs at any depth, each with its expected model type."""
     config_key: str | None = None
     """Entry of config.json that holds the config of the network, or None if the whole file is the config."""
     min_transformers: str = "4.50"
-    """First version of transformers that implements the network."""
+    """Minimum version of transformers for the network."""
 
 
 _SAM2_NESTED = (("vision_config.backbone_config", "sam2_hiera_det_model"),)
@@ -145,7 +145,7 @@ def load_pretrained_sam(folder: Path, kind: SamFamily) -> Any:
 
 @contextmanager
 def _quiet(transformers: Any) -> Iterator[None]:
-    """Disable the progress bar of transformers and its reports on parameters."""
+    """Disable the progress bar and the warnings of transformers in the `with` block."""
     logging = transformers.utils.logging
     level, bar = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity_error()
@@ -159,7 +159,7 @@ def _quiet(transformers: Any) -> Iterator[None]:
 
 
 def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
-    """Return the parts of a network's config that `check_config_sizes` keeps; raise InputError if one is invalid."""
+    """Return the sub-configs of a network without ignored entries; raise InputError if one is missing or invalid."""
     own = config if kind.config_key is None else config.get(kind.config_key)
     parts = {name: own.get(name) for name in kind.config_parts} if isinstance(own, Mapping) else {}
     for name, part in parts.items():
@@ -178,7 +178,7 @@ def _sizes(config: dict[str, Any], kind: SamFamily) -> dict[str, Any]:
 
 
 def check_config_sizes(values: Any, name: str = CONFIG_FILE, depth: int = 0) -> Any:
-    """Return a config without its ignored entries; raise InputError if it is too large or a number is implausible.
+    """Return a config without ignored entries; raise InputError if it is too large or a number is implausible.
 
     Without this check, transformers would build a network of any size.
     """
@@ -215,7 +215,7 @@ _OTHERS = {
     "mask_decoder.hf_token": "HQ-SAM",
     "mask_decoder.compress_vit_feat": "HQ-SAM",
 }
-"""Names of other networks, by prefixes of their parameter names."""
+"""Names of networks other than the original SAM, by prefixes of their parameter names."""
 _MLP = {"0": "proj_in", "1": "layers.0", "2": "proj_out"}
 _SHARED = ("shared_image_embedding.positional_embedding", "prompt_encoder.shared_embedding.positional_embedding")
 _NAMES = {
@@ -240,15 +240,16 @@ _NAMES = {
     r"\.output_upscaling\.1\.": ".upscale_layer_norm.",
     r"\.output_upscaling\.3\.": ".upscale_conv2.",
 }
-"""Patterns of Meta's parameter names, with their replacements in transformers."""
+"""Patterns in Meta's parameter names, each with its replacement in transformers."""
 
 
 def check_sam_checkpoint(checkpoint: str, kinds: Mapping[str, SamFamily] = POINT_PROMPT_FAMILIES) -> None:
-    """Check the name of a checkpoint and the config.json of a local folder, without downloads and without weights.
+    """Check the name of a checkpoint and its local config.json, if any, without downloading or loading weights.
 
     Raises:
-        ValueError: If transformers is not installed, or too old for the network.
-        ValueError: If the checkpoint is neither a path nor a hub name (OWNER/NAME), or belongs to another network.
+        ValueError: If transformers is not installed, or if torch or transformers is too old for the network.
+        ValueError: If the checkpoint is neither a path nor a hub name (OWNER/NAME), its config.json is damaged, or it
+            belongs to another network.
         FileNotFoundError: If the checkpoint looks like a path but does not exist.
     """
     import_transformers()
@@ -324,12 +325,12 @@ def _load_first_sam(path: Path) -> Any:
 def locate_sam(checkpoint: str, kinds: Mapping[str, SamFamily], more: Sequence[str] = ()) -> Path:
     """Return the path of a checkpoint, and download it from the hub if necessary.
 
-    The download starts with config.json, and continues only if it describes one of `kinds`.
+    The download starts with config.json, and continues only if this file describes one of `kinds`.
 
     Args:
         checkpoint: Path or hub name.
         kinds: Accepted networks, by the model type in config.json.
-        more: Patterns of additional files.
+        more: Patterns of additional files to download.
     Raises:
         FileNotFoundError: If the checkpoint cannot be downloaded.
     """
@@ -355,7 +356,7 @@ def _read_folder(folder: Path) -> tuple[Any, dict[str, Tensor]]:
 
 
 def _weight_files(folder: Path) -> list[Path]:
-    """Return the weight file of a folder, or an empty list."""
+    """Return a list with the weight file of a folder, or an empty list if there is none."""
     return [folder / name for name in SAM_WEIGHT_FILES if (folder / name).is_file()][:1]
 
 

@@ -1,7 +1,7 @@
 """Regions between learned edges, from an edge detector and the watershed hierarchy of its edge map.
 
 The detector is HED (Xie and Tu, "Holistically-Nested Edge Detection", ICCV 2015), trained on BSDS500. It is a VGG16
-with a side output after each of its five blocks, and outputs a weighted sum of these.
+with a side output after each of its five blocks. A weighted sum of the side outputs gives the edge map.
 
 The hierarchy is the watershed by area (Cousty and Najman, "Incremental Algorithm for Hierarchical Minimum Spanning
 Forests and Saliency of Watershed Cuts", ISMM 2011). It merges adjacent basins of the edge map in the order of the
@@ -36,7 +36,7 @@ similar size, it detects the outlines of objects rather than their texture."""
 EdgeLevel = Literal["s", "m", "l"]
 EDGE_LEVELS: tuple[EdgeLevel, ...] = get_args(EdgeLevel)
 EDGE_COUNTS: tuple[int, ...] = (300, 120, 40)
-"""Numbers of regions per image at the levels s, m and l."""
+"""Maximum numbers of regions per image at the levels s, m and l."""
 _CHANNELS, _DEPTHS = (64, 128, 256, 512, 512), (2, 2, 3, 3, 3)
 """Numbers of channels and of convolutions of each block."""
 _MEAN = (104.00699, 116.66877, 122.67892)
@@ -51,7 +51,7 @@ ALGORITHM = 2
 
 
 class EdgeNetwork(nn.Module):
-    """The HED network with random weights.
+    """The HED network, initially with random weights.
 
     Args:
         channels: Numbers of channels of the five blocks.
@@ -83,7 +83,7 @@ class EdgeNetwork(nn.Module):
         return _convolve(self.fuse, torch.cat(maps, dim=1))[0, 0].sigmoid()
 
     def layers(self) -> Iterator[tuple[str, nn.Conv2d]]:
-        """Yield the convolutions with their names in Keras files."""
+        """Yield each convolution, preceded by its name in Keras files."""
         for number, (block, side) in enumerate(zip(self.blocks, self.sides), 1):
             for i, convolution in enumerate(block):
                 yield f"block{number}/layers/conv2d{f'_{i}' if i > 0 else ''}", convolution
@@ -92,7 +92,7 @@ class EdgeNetwork(nn.Module):
 
 
 def _convolve(layer: Any, pixels: Float32[Tensor, "1 c h w"]) -> Float32[Tensor, "1 d h w"]:
-    """Return the convolution, on a GPU always with the same algorithm and in float32.
+    """Apply a convolution, on a GPU with a deterministic algorithm and without TF32.
 
     The switches of `torch.backends.cudnn` would also change networks that run in other threads.
     """
@@ -201,8 +201,8 @@ class EdgeRegions(RegionDefaults):
 
     Threads share the network, one image at a time, and compute the watersheds of several images concurrently.
 
-    The regions of an image are reproducible on the same device. Other devices and thread counts change the rounding of
-    the network, and thereby single pixels of the edge map.
+    The regions of an image are reproducible on the same device with the same number of threads. Otherwise, rounding in
+    the network can change individual pixels of the edge map.
     """
 
     level: EdgeLevel = "m"
@@ -212,7 +212,7 @@ class EdgeRegions(RegionDefaults):
     device: str = "cpu"
     """Device of the network."""
     pixels: int = WORKING_PIXELS
-    """Approximate largest number of pixels of the network input."""
+    """Approximate maximum number of pixels of an image at the working size."""
 
     at_once = WORKERS
 
@@ -224,7 +224,7 @@ class EdgeRegions(RegionDefaults):
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Numbers of regions of all levels."""
+        """Number of regions of each level."""
         return EDGE_COUNTS if self.count is None else (self.count,)
 
     @property

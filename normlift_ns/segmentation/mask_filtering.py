@@ -1,4 +1,4 @@
-"""Filtering of binary masks, with boxes, suppression, and removal of small holes and pieces."""
+"""Measurement and suppression of binary masks, and removal of their small holes and pieces."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from torch.nn.functional import pad
 from normlift_ns.segmentation.regions import column_chunks
 
 _MIN_KEPT = 3
-"""Number of the best masks that pass the threshold of scores if no score is high enough."""
+"""Number of highest-scoring masks that pass the score threshold if no score is above it."""
 
 
 @dataclass(frozen=True)
 class Suppression:
-    """Thresholds of LangSplat's mask suppression. The defaults are its settings.
+    """Thresholds of LangSplat's mask suppression. The defaults are LangSplat's settings.
 
     Mask A is inside mask B if A covers less than `outer` of B, and B covers at least `inner` of A.
-    Masks inside other masks are dropped, whatever their score is.
+    Masks inside other masks are dropped, regardless of their scores.
     """
 
     iou: float = 0.8
-    """Drop a mask if its IoU with a mask of higher score is above this threshold."""
+    """Drop a mask if its IoU with a higher-scoring mask is above this threshold."""
     score: float = 0.7
     """Drop a mask if its score is not above this threshold. If no score is above it, the best three masks pass."""
     outer: float = 0.5
@@ -39,15 +39,15 @@ class MaskMeasurements(NamedTuple):
     """Areas and boxes of masks."""
 
     inner: Int32[Tensor, " m"]
-    """Number of pixels with a logit above the offset in `measure_logits`."""
+    """Number of pixels of each mask with a logit above the `offset` of `measure_logits`."""
     outer: Int32[Tensor, " m"]
-    """Number of pixels with a logit above minus the offset in `measure_logits`."""
+    """Number of pixels of each mask with a logit above -`offset`."""
     boxes: Int64[Tensor, "m 4"]
     """Boxes of the pixels with a positive logit, in the format of `masks_to_boxes`."""
 
     @property
     def stability(self) -> Float[Tensor, " m"]:
-        """IoU of the masks that the two thresholds give, or NaN if both masks are empty."""
+        """IoU of each mask at the two logit thresholds, inner / outer, or NaN if both areas are 0."""
         return self.inner / self.outer
 
 
@@ -68,8 +68,8 @@ def mask_nms(
     Each mask is compared with all others, including dropped ones. Intersections are counted exactly, and ratios are
     compared in float64. If two scores are equal, the earlier mask is the better one.
 
-    LangSplat also requires 1 - (inter/area_i)(inter/area_j) > 0.5 for a mask inside another mask. The conditions on
-    `outer` and `inner` imply this.
+    LangSplat also requires 1 - (inter/area_i)(inter/area_j) > 0.5 for a mask inside another mask. The default `outer`
+    implies this.
 
     Args:
         scores: Stability times predicted IoU.
@@ -105,7 +105,7 @@ def masks_to_boxes(masks: Bool[Tensor, "m h w"]) -> Int64[Tensor, "m 4"]:
 def _intersections(masks: Bool[Tensor, "m h w"]) -> Float64[Tensor, "m m"]:
     """Return the number of pixels that each pair of masks shares.
 
-    Float32 sums of ones are exact up to 2^24, the largest number of pixels of a chunk.
+    Float32 sums of ones are exact up to 2^24, the maximum number of pixels in a chunk.
     """
     flat = masks.flatten(1)
     both = torch.zeros(len(flat), len(flat), dtype=torch.float64, device=masks.device)
@@ -136,7 +136,7 @@ def _row_products(part: Bool[Tensor, "m p"]) -> Tensor:
 
 
 _REGION_CHUNK = {"cuda": 2**29, "cpu": 2**25}
-"""Number of pixels per chunk, by device type."""
+"""Maximum number of pixels in a chunk of several masks, by device type."""
 
 
 def remove_small_regions(masks: Bool[Tensor, "m h w"], least: int) -> tuple[Bool[Tensor, "m h w"], Bool[Tensor, " m"]]:
@@ -166,15 +166,15 @@ def remove_small_regions(masks: Bool[Tensor, "m h w"], least: int) -> tuple[Bool
 
 
 class _Runs(NamedTuple):
-    """Runs of neighboring pixels in the rows of a mask, in ascending order."""
+    """Runs of neighboring pixels in the rows of masks, in ascending order."""
 
     start: Int64[Tensor, " n"]
     stop: Int64[Tensor, " n"]
     """First position after each run."""
     piece: Int64[Tensor, " n"]
-    """Number of the component of each run. Large components may share a number."""
+    """Index of the component of each run. Large components may share an index."""
     area: Int64[Tensor, " n"]
-    """Number of pixels of the component that contains each run. It is guaranteed exact only for small components."""
+    """Number of pixels of the component that contains each run. It can be inexact for large components."""
 
     def at(self, index: Tensor) -> _Runs:
         return _Runs(*(value[index] for value in self))
@@ -212,10 +212,10 @@ class _Grid(NamedTuple):
         return 8 * word[index] + offset
 
     def row_bounds(self, edges: Int64[Tensor, " e"], least: int) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
-        """Return the first position of rows, and the position after their last pixel.
+        """Return the first position of each row that can contain small holes, and the position after its last pixel.
 
         If images are at least `least` pixels wide, components that contain a whole row are large. The result then has
-        only rows with edges and the rows above and below them. Otherwise, it has all rows.
+        only the rows with edges and the rows above and below them. Otherwise, it has all rows.
         """
         near = torch.full((self.masks, self.height + 1), self.width < least, device=edges.device)
         near.view(-1)[edges // self.row] = True
@@ -239,7 +239,7 @@ def _symmetric_difference(edges: Int64[Tensor, " e"], *others: Int64[Tensor, " n
 
 
 def _runs(edges: Int64[Tensor, " e"], grid: _Grid, least: int) -> _Runs:
-    """Return the runs between edges with their components. All runs of at least `least` pixels form one component."""
+    """Return the runs between edges with their components. All runs of at least `least` pixels are in one component."""
     start, stop = edges[0::2].contiguous(), edges[1::2].contiguous()
     first = torch.searchsorted(stop, start - grid.row)  # neighbors in the row above, including diagonal ones
     last = torch.searchsorted(start, stop - grid.row, right=True)
@@ -293,6 +293,6 @@ def _in_largest(runs: _Runs, grid: _Grid) -> Bool[Tensor, " n"]:
 
 
 def _spans(first: Int64[Tensor, " n"], length: Int64[Tensor, " n"]) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"]]:
-    """Return the numbers of all ranges first[i]..first[i] + length[i] - 1, preceded by the array of their indices i."""
+    """Concatenate ranges first[i]..first[i] + length[i] - 1; return the index i and the value of each element."""
     owner = torch.repeat_interleave(length)
     return owner, torch.arange(len(owner), device=first.device) + (first - length.cumsum(0) + length)[owner]

@@ -26,9 +26,9 @@ _IMAGE_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM")
 """Formats of training images. Pillow passes some other formats to external programs, such as PostScript to
 Ghostscript."""
 _MASK_CHUNK = {"cuda": 2**29, "cpu": 2**26}
-"""Number of elements of the largest temporary array of masks, by device type."""
+"""Approximate maximum number of elements in a temporary array of masks, by device type."""
 _MAX_PIXELS = 2**27
-"""Largest number of pixels, 16,384 x 8,192. A file of a few bytes can decode to a huge image of equal pixels."""
+"""Maximum number of pixels of an image, 16,384 x 8,192. A small file can decode to a huge image of equal pixels."""
 
 
 def read_image(path: Path) -> UInt8[Tensor, "h w 3"]:
@@ -102,7 +102,7 @@ class RegionDefaults:
 
 @dataclass(frozen=True)
 class Superpixels(RegionDefaults):
-    """Superpixels of CIELAB color and position, which have similar sizes and follow image edges."""
+    """Superpixels of similar size that follow image edges, from k-means of CIELAB color and position."""
 
     count: int = 256
     """Approximate number of superpixels per image, at least 1. An image has at most one per pixel."""
@@ -140,13 +140,13 @@ class Grid(RegionDefaults):
 class LabelFiles(RegionDefaults):
     """Label maps from a folder, one per image.
 
-    A PNG file is grayscale with 1, 8 or 16 bits, or indexed, with palette indices as labels. An NPY file has any
-    integer type, and can contain several levels, [levels, H, W]. The map of "images/left/0001.jpg" is the first of
+    A PNG file is grayscale with 1, 8 or 16 bits, or indexed, with palette indices as labels. An NPY file has an integer
+    or Boolean type, and can contain several levels, [levels, H, W]. The map of "images/left/0001.jpg" is the first of
     images/left/0001.png, left/0001.png and 0001.png that exists in the folder. NPY files have the same names with the
     suffix .npy. All pixels with the same value form one region, even if they are not connected.
 
     Raises:
-        FileNotFoundError: If the folder does not exist, or is not a folder.
+        FileNotFoundError: If `folder` does not exist or is not a folder.
     """
 
     folder: Path
@@ -155,13 +155,13 @@ class LabelFiles(RegionDefaults):
     level: int | None = None
     """Index of the selected level in NPY files [levels, H, W], or None for files [H, W]."""
     resample: bool = False
-    """True to resize maps of a different size by nearest-neighbor interpolation, False to raise an error."""
+    """True to resize maps of any size (nearest neighbor), False to accept only sizes that match `divisor`."""
     divisor: int = 1
     """Factor by which images were downscaled (`lift_downscale`). Maps of full-size images are downscaled to match."""
     undistort: Callable[[str, np.ndarray], np.ndarray] | None = None
     """Function of an image name and its maps [levels, H, W] that undistorts maps of original, distorted images.
 
-    If None, the maps show the undistorted images."""
+    If None, the maps already match the undistorted images."""
     description: str = "label map"
     """Description of a file in messages."""
     flag: str = "--regions-dir"
@@ -223,7 +223,8 @@ class LabelFiles(RegionDefaults):
 
         Raises:
             FileNotFoundError, ValueError: For the same reasons as `values`.
-            ValueError: If a map and its image differ in size, unless `resample` is True or `divisor` explains it.
+            ValueError: If a map and its image differ in size, unless `resample` is True or `divisor` explains
+                the difference.
         """
         path, maps = self.path(name), self.values(name)
         height, width = image.shape[:2]
@@ -248,7 +249,7 @@ class LabelFiles(RegionDefaults):
         return path, width, height
 
     def values(self, name: str) -> np.ndarray:
-        """Read the label maps of an image, [levels, H, W], with their stored integer type unless `undistort` is given.
+        """Read the label maps of an image as integers, [levels, H, W].
 
         Raises:
             FileNotFoundError, ValueError: For the same reasons as `path`.
@@ -312,8 +313,8 @@ def _compact(values: np.ndarray, labeled: np.ndarray) -> Int32[Tensor, "h w"]:
 def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
     """Convert masks to a stack of label maps.
 
-    At each pixel, the maps have the indices of the masks that cover it, in descending order, followed by -1. The depth
-    of the stack is the largest number of masks that share a pixel, at least 1.
+    At each pixel, the maps contain the indices of the masks that cover it, in descending order, followed by -1. The
+    depth of the stack is the largest number of masks that share a pixel, at least 1.
     """
     flat = masks.flatten(1)
     depth = max(1, int(flat.sum(dim=0).max()))
@@ -328,7 +329,7 @@ def stack_masks(masks: Bool[Tensor, "m h w"]) -> Int32[Tensor, "depth h w"]:
 
 
 def column_chunks(flat: Bool[Tensor, "m p"]) -> Iterator[slice]:
-    """Yield slices of columns. M rows of one slice fit into a temporary array of about `_MASK_CHUNK` elements."""
+    """Yield slices of the columns of masks, each with at most 2^24 columns and about `_MASK_CHUNK` elements."""
     step = min(2**24, max(1, _MASK_CHUNK[flat.device.type] // max(1, len(flat))))
     return (slice(start, start + step) for start in range(0, flat.shape[1], step))
 
@@ -349,9 +350,9 @@ COMPACTNESS = 10.0
 """Weight of spatial distance relative to color distance. Larger values produce squarer superpixels."""
 _ROUNDS = 5
 _SMALLEST = 0.25
-"""Number of pixels of the smallest piece that stays a superpixel, relative to that of a cell."""
+"""Number of pixels below which a piece joins a neighbor, as a fraction of the mean number per superpixel."""
 _FAR = 1e4
-"""Coordinates of centers that no pixel joins."""
+"""Coordinates that prevent pixels from joining a center."""
 _AROUND = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1))
 _WHITE = (0.95047, 1.0, 1.08883)
 """XYZ of white for the illuminant D65."""
@@ -363,10 +364,10 @@ _LAB = ((0.0, 116.0, 0.0), (500.0, -500.0, 0.0), (0.0, 200.0, -200.0))
 def superpixels(image: UInt8[Tensor, "h w 3"], count: int) -> Int32[np.ndarray, "h w"]:
     """Divide an image into connected regions of similar size and color.
 
-    An image always has the same regions on the same device. Those of another device differ by rounding.
+    The regions of an image are reproducible on the same device. On another device, rounding can change them.
 
     Args:
-        image: RGB, 0..255, on the device that computes.
+        image: RGB image with values in 0..255, on the device that computes the regions.
         count: Approximate number of regions, at least 1. An image has at most one per pixel.
     Returns:
         Region of each pixel, 0..R-1, without gaps.
@@ -395,7 +396,7 @@ class _Grid:
     """Height of a cell in pixels."""
     width: int
     side: float
-    """Side of a square of the mean size of a superpixel, the unit of positions."""
+    """Side in pixels of a square with the mean area of a superpixel, used as the unit of positions."""
 
     @classmethod
     def of(cls, height: int, width: int, count: int) -> _Grid:
@@ -404,7 +405,7 @@ class _Grid:
         return cls(rows, columns, math.ceil(height / rows), math.ceil(width / columns), side)
 
     def cells(self, image: UInt8[Tensor, "h w 3"]) -> Float32[Tensor, "cells 6 y x"]:
-        """Return six values per pixel: CIELAB / compactness, the position relative to the middle of the cell, and 1.
+        """Return six values per pixel: CIELAB / COMPACTNESS, the position relative to the middle of the cell, and 1.
 
         All six are 0 outside the image.
         """
@@ -419,7 +420,7 @@ class _Grid:
         return cells.permute(1, 3, 0, 2, 4).flatten(0, 1).contiguous()
 
     def shifts(self, like: Tensor) -> Float32[Tensor, "9 6"]:
-        """Return the position of the nine cells of a window relative to the middle one."""
+        """Return the positions of the nine cells of a window relative to the middle one."""
         size = (self.height / self.side, self.width / self.side)
         return like.new_tensor([(0, 0, 0, y * size[0], x * size[1], 0) for y, x in _AROUND])
 
@@ -435,7 +436,7 @@ class _Grid:
     def sums(
         self, points: Float32[Tensor, "cells 6 p"], nearest: Int64[Tensor, "cells p"]
     ) -> Float32[Tensor, "rows columns 6"]:
-        """Return the sum of the points that joined each center, with positions relative to its own cell."""
+        """Return the sum of the points that joined each center, with positions relative to the cell of this center."""
         joined = (nearest[:, None] == torch.arange(9, device=nearest.device)[:, None]).float()
         parts = torch.bmm(joined, points.transpose(1, 2))
         parts = (parts - self.shifts(points) * parts[..., 5:]).view(self.rows, self.columns, 9, 6)
@@ -446,7 +447,7 @@ class _Grid:
 
 
 def _windows(values: Tensor, outside: float) -> Tensor:
-    """Return the values [rows, columns, C] of each cell and of its neighbors, [cells, 9, C]."""
+    """Return the values [rows, columns, C] of each cell and its eight neighbors as [cells, 9, C]."""
     rows, columns = values.shape[:2]
     padded = torch.nn.functional.pad(values, (0, 0, 1, 1, 1, 1), value=outside)
     return torch.stack([padded[1 + y :, 1 + x :][:rows, :columns] for y, x in _AROUND], dim=2).flatten(0, 1)
@@ -465,10 +466,10 @@ def _cielab(image: UInt8[Tensor, "h w 3"]) -> Float32[Tensor, "3 h w"]:
 
 
 def _join_fragments(labels: Int32[np.ndarray, "h w"], smallest: float) -> Int32[np.ndarray, "h w"]:
-    """Number the connected pieces of the labels, and add small ones to a neighbor.
+    """Number the connected pieces of a label map, after merging small pieces into neighbors.
 
     Args:
-        labels: Any labels. Two pieces with the same label become two regions.
+        labels: Any labels. Separate pieces with the same label become separate regions.
         smallest: Number of pixels below which a piece is small. A small piece joins the region of a neighbor that is
             not small or has already joined a region. If several neighbors qualify, it joins the one with which it
             shares the longest boundary.
@@ -491,7 +492,7 @@ def _join_fragments(labels: Int32[np.ndarray, "h w"], smallest: float) -> Int32[
 
 
 def _connected_pieces(labels: Int32[np.ndarray, "h w"]) -> tuple[Int32[np.ndarray, "h w"], int]:
-    """Return the piece of each pixel, and the number of pieces. Pixels connect to equal ones on their four sides."""
+    """Return the 4-connected piece of equal labels that contains each pixel, and the number of pieces."""
     import cv2  # noqa: PLC0415 (other regions do not need it)
 
     height, width = labels.shape
@@ -506,7 +507,7 @@ def _connected_pieces(labels: Int32[np.ndarray, "h w"]) -> tuple[Int32[np.ndarra
 def _boundaries(
     pieces: Int32[np.ndarray, "h w"], small: Bool[np.ndarray, "h w"]
 ) -> tuple[Int32[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
-    """Return pairs of adjacent pieces, one pair for each pixel of a small piece and each neighbor in another piece."""
+    """Return pairs of adjacent pieces, one for each pixel of a small piece and each neighbor of it in another piece."""
     found = []
     for one, other, at in (
         (pieces[:, 1:], pieces[:, :-1], small[:, 1:]),

@@ -39,7 +39,7 @@ class MaskSource:
     """
 
     make: Callable[[SourceOptions, str], Regions | FeatureSource]
-    """Function that makes the regions for options and a device such as "cuda". Weights should be loaded on first
+    """Function that creates the regions for options and a device such as "cuda". Weights should be loaded on first
     use."""
     check: Callable[[SourceOptions], None] = lambda options: None
     """Function that raises InputError or FileNotFoundError for unusable options, without importing torch."""
@@ -245,7 +245,7 @@ def _preferred_regions(options: SourceOptions, device: str) -> list[str]:
 
 
 def _is_here(regions: str) -> bool:
-    """Return whether the default weights and the packages of regions are on this machine."""
+    """Return whether the default weights and the packages that regions need are on this machine."""
     if regions in _PACKAGES and find_spec(_PACKAGES[regions]) is None:
         return False
     return EDGES.is_here if regions == "edges" else regions != "sam" or find_local_sam(DEFAULT_SAM) is not None

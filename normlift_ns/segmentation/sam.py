@@ -168,7 +168,7 @@ def _per_head(attention: Any, projection: Any) -> Tensor:
 
 
 def _image_scores(keys: Tensor, positions: Tensor | None) -> Callable[[Tensor], Tensor]:
-    """Return a function that computes the products [P, K, N] of vectors [P, K, C] and the image with its positions.
+    """Return a function that computes the products [P, K, N] of vectors [P, K, C] with the image and its positions.
 
     Args:
         keys: Embedding of the image, [N, C] or [P, N, C].
@@ -226,7 +226,7 @@ class _Norm(NamedTuple):
 
 
 class _Upscaling(NamedTuple):
-    """Two transposed convolutions with the layer norm and the activations between and after them."""
+    """Two transposed convolutions, with a layer norm between them and an activation after each."""
 
     side: int
     """Side of the image embedding, in positions."""
@@ -266,7 +266,7 @@ def _load_upscaling(model: Any, dtype: torch.dtype) -> _Upscaling:
 _MEAN = torch.tensor([123.675, 116.28, 103.53])[:, None, None]
 _STD = torch.tensor([58.395, 57.12, 57.375])[:, None, None]
 _BATCHES = {"cuda": (5, 256, 64), "cpu": (1, 16, 16)}
-"""Numbers of images, prompts and masks per batch, by device type."""
+"""Maximum numbers of images, prompts and masks per batch, by device type."""
 
 
 class PromptedNetwork(ABC):
@@ -301,7 +301,7 @@ class PromptedNetwork(ABC):
 
     @abstractmethod
     def _embed(self, pixels: Tensor) -> list[Any]:
-        """Return the embeddings of a batch of images that fits into memory."""
+        """Return the embeddings of one batch of network inputs on the device."""
 
     @abstractmethod
     def decode(self, embedding: Any, points: Float[Tensor, "b 2"]) -> MaskPredictions:
@@ -333,7 +333,7 @@ class PromptedNetwork(ABC):
     ) -> mask_filtering.MaskMeasurements:
         """Return the measurements of `measure_logits` for enlarged logits.
 
-        With Triton, the logits are not enlarged in memory. A pixel whose logit equals a threshold up to rounding can
+        With Triton, the logits are not enlarged in memory. Pixels whose logit equals a threshold up to rounding can
         then be counted differently.
         """
         if len(logits) > 0 and can_use_triton(logits):
@@ -377,7 +377,7 @@ class SamNetwork(PromptedNetwork):
     def decode(self, embedding: Float[Tensor, "1 c y x"], points: Float[Tensor, "b 2"]) -> MaskPredictions:
         """Return logits and predicted IoU of the three masks of each point (x, y), in pixels of the network input.
 
-        If values overflow in float16, they are recomputed in float32.
+        If a predicted IoU overflows in float16, the points are decoded again in float32.
         """
         masks, ious = self._decoder(embedding, points.to(self._device))
         if self._dtype == torch.float16 and not bool(ious.isfinite().all()):
@@ -546,8 +546,8 @@ SAM_LEVELS: tuple[SamLevel, ...] = get_args(SamLevel)
 CropBox = tuple[int, int, int, int]
 """Box (x0, y0, x1, y1) in pixels, with x1 and y1 exclusive."""
 _GROUP_OFFSET = 2**22
-"""Distance between groups of boxes. It exceeds the width of all images, and float32 represents all integers up to four
-times this value."""
+"""Distance between groups of boxes. It exceeds the width of any realistic image, and float32 represents all integers up
+to four times this value."""
 
 
 @dataclass(frozen=True)
@@ -600,11 +600,11 @@ class _Candidates(NamedTuple):
 class SamMasks(RegionDefaults):
     """Regions from one level of SAM's automatic masks. Weights are loaded on first use.
 
-    The network segments one image at a time, while another thread prepares the maps of the previous image.
+    The network segments one image at a time, while another thread processes the label maps of the previous image.
 
     Raises:
-        ValueError: If transformers is not installed or too old, or the checkpoint is neither a path nor a hub name, or
-            belongs to another network.
+        ValueError: If torch or transformers is missing or too old, or the checkpoint is invalid or belongs to another
+            network.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 
@@ -648,7 +648,7 @@ class SamMasks(RegionDefaults):
             FileNotFoundError: If the weights cannot be downloaded.
             ValueError: If the checkpoint is damaged or belongs to another network, or the installed torch or
                 transformers is too old.
-            MemoryError: If a single image or prompt does not fit into the memory of the device.
+            MemoryError: If a single image or prompt does not fit into GPU memory.
         """
         rules = self.rules
         size = image.shape[0], image.shape[1]
@@ -683,7 +683,7 @@ class SamMasks(RegionDefaults):
         }
 
     def _candidates(self, embedding: Tensor, crop: CropBox, number: int, size: tuple[int, int]) -> _Candidates:
-        """Return the masks of one crop that pass the thresholds and do not touch its border."""
+        """Return the masks of one crop that pass the thresholds and do not touch its border inside the image."""
         x0, y0, x1, y1 = crop
         network, rules, crop_size = self.network, self.rules, (y1 - y0, x1 - x0)
         points = point_grid(rules.points_per_side) * torch.tensor([x1 - x0, y1 - y0])
@@ -766,7 +766,7 @@ def _distinct(
 ) -> dict[SamLevel, Int64[Tensor, " k"]]:  # fmt: skip
     """Suppress overlapping boxes within each group (non-maximum suppression).
 
-    One call handles all groups, because each call waits for the GPU. An offset separates the boxes of different groups.
+    One NMS call handles all groups, because each call waits for the GPU. An offset separates boxes of different groups.
 
     Returns:
         The indices to keep in each group, in descending order of scores. Equal scores keep their order.

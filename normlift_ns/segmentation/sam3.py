@@ -42,7 +42,7 @@ _MASK_THRESHOLD = 0.5
 TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")
 _MAX_TOKENS = 32
 _TOGETHER = 16
-"""Number of masks per batch at the size of the image."""
+"""Maximum number of image-sized masks per batch."""
 
 
 class TextMasks(NamedTuple):
@@ -160,8 +160,8 @@ class Sam3Masks(RegionDefaults):
     If instances overlap, the lift uses the one with the higher score. Pixels without an instance are unlabeled.
 
     Raises:
-        ValueError: If transformers is not installed or too old, or the checkpoint is neither a path nor a hub name, or
-            belongs to another network.
+        ValueError: If torch or transformers is missing or too old, or the checkpoint is invalid or belongs to another
+            network.
         FileNotFoundError: If the checkpoint is a path that does not exist.
     """
 
@@ -181,7 +181,7 @@ class Sam3Masks(RegionDefaults):
         return {**sam3_identity(self.checkpoint, self.device, self.precision), "texts": list(self.texts)}
 
     def labels(self, image: UInt8[Tensor, "h w 3"], name: str) -> Int32[Tensor, "1 depth h w"]:
-        """Return label maps as in `Regions.labels`. Raises the errors of `Sam3Network.load` and `segment`."""
+        """Return label maps as in `Regions.labels`. Raises the errors of `load` and `segment` of `Sam3Network`."""
         masks, scores = (torch.cat(parts) for parts in zip(*self.network.segment(image, self.texts)))
         rows = masks.flatten(1).any(dim=1).nonzero()[:, 0]
         ascending = rows[torch.sort(scores[rows], stable=True).indices]
