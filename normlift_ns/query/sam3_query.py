@@ -84,7 +84,7 @@ class MaskEvidence:
     """True for the cells inside the mask of each prompt."""
 
     def answer(self, text: int) -> MaskResult:
-        """Lift the masks of the prompt with this index."""
+        """Lift the masks of the prompt with index `text`."""
         evidence, inside = self.evidence, self.inside[text]
         column, weight = evidence.rows.column.long(), evidence.rows.weight.double()
         row, view = evidence.rows.row_index(), evidence.region_view[column].long()
@@ -164,12 +164,12 @@ class SegmentationResult(NamedTuple):
     """Minimum reliability R of a selected Gaussian, in 0..1."""
 
     def selected(self, text: int) -> Bool[Tensor, " n"]:
-        """Return the mask of sufficiently reliable Gaussians with more than half of their weight inside the masks."""
+        """Return a mask of the reliable Gaussians with more than half of their weight inside the masks of SAM 3."""
         answer = self.answers[text]
         return answer.mask & (answer.scalars.reliability >= self.min_reliability)
 
     def summarize(self, means: Float[Tensor, "n 3"], selected: Bool[Tensor, "n q"]) -> list[dict[str, Any]]:
-        """Return the numbers of every prompt as plain Python types.
+        """Return summary statistics of every prompt as plain Python types.
 
         Args:
             means: Centers of the Gaussians.
@@ -216,7 +216,7 @@ def query_sam3(
         texts: Prompts.
         views: Maximum number of views.
         min_reliability: Minimum reliability R of a selected Gaussian, in 0..1.
-        settings: Constants of the rasterizer.
+        settings: Rasterizer settings (default: those of gsplat 1.4).
         device: Device of the rasterizer.
     Raises:
         FileNotFoundError: An image does not exist.
