@@ -121,7 +121,7 @@ class Why:
         return tuple(sorted(votes, key=lambda vote: -vote.disagreement))
 
     def images_to_show(self, count: int = 3) -> tuple[tuple[ViewVote, ...], tuple[ViewVote, ...]]:
-        """Return the votes of the heaviest images and of other images that disagree, at most `count` of each kind.
+        """Return the votes of the images with the largest weights and of others that disagree, at most `count` of each.
 
         An image disagrees if the cosine between its vote and the sum of all votes is below 0.9.
         """
@@ -360,7 +360,7 @@ class RecordedVotes:
         return explain_selection(evidence, features, selected, source=source, beta=beta, unlabeled=unlabeled)
 
     def pictures(self, votes: Iterable[ViewVote]) -> Iterator[VoteImage]:
-        """Yield the images one after another, with outlines of the regions that voted.
+        """Yield the image of each vote, with outlines of the regions that voted.
 
         Raises:
             FileNotFoundError: An image no longer exists.

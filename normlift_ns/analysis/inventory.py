@@ -2,7 +2,7 @@
 
 Two neighboring Gaussians get a score from each image in which both have a region. The score is 1 if both have the same
 region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s measures how much
-the views usually disagree. It is the mean of 1 - median ||f_j|| before and after the consensus, with f_j the mean
+the views typically disagree. It is the mean of 1 - median ||f_j|| before and after the consensus, with f_j the mean
 feature of Gaussian j. The affinity of two parts is the mean of the scores over all images and all pairs of neighbors
 across their border, reduced if there are few scores::
 
@@ -49,7 +49,7 @@ _MIN_VISIBLE = 0.25
 _MIN_REGION = 0.25
 """Minimum weight of a Gaussian in its region of an image, as a fraction of its weight in the image over all levels."""
 _SPREADS = 3.0
-"""Disagreement of two regions at which their similarity is 0, as a multiple of the usual disagreement."""
+"""Disagreement of two regions at which their similarity is 0, as a multiple of the typical disagreement s."""
 _LEVELS = tuple(level / 20 for level in range(19, 9, -1))
 """Minimum affinities of the successive rounds of merging, from 0.95 to 0.5."""
 _MANY_WORDS = 100
@@ -65,7 +65,7 @@ class Inventory:
     """Main objects of a scene, by descending evidence: large objects and those that many images show come first."""
 
     instance_id: Int32[Tensor, " n"]
-    """Number of the object of every Gaussian, from 1; 0 for Gaussians without an object."""
+    """Object number of every Gaussian, from 1; 0 for Gaussians without an object."""
     catalog: Catalogue
     """Catalog of the objects. The text of an object is a word of the vocabulary, or a numbered name such as "object 3";
     see `name_objects`."""
@@ -186,7 +186,7 @@ def find_inventory(
     Args:
         features: One unit row per column (region) of the evidence.
         means: Centers of the Gaussians.
-        spread: Usual disagreement of the views about a Gaussian, `RecordedVotes.disagreement`.
+        spread: Typical disagreement of the views about a Gaussian, from `RecordedVotes.disagreement`.
     """
     evidence = evidence.to("cpu")
     part = _join(len(means), _neighbor_borders(view_regions(evidence), features.cpu(), means.cpu(), spread))

@@ -163,7 +163,7 @@ def center_evidence(
 ) -> Evidence:
     """Return evidence as in Occam's LGS, which assigns a Gaussian to the pixel at its projected center in every view.
 
-    The entry of this pixel has the weight of the Gaussian in the whole view.
+    The weight is that of the Gaussian in all labeled pixels of the view.
 
     Args:
         columns: Column of every pixel in the evidence, for each view; negative for pixels without a column.
@@ -229,9 +229,9 @@ def iter_medians(
 ) -> Iterator[tuple[Int[Tensor, " b"], Float[Tensor, "b d"]]]:
     """Yield (Gaussians, unit directions) as in VALA, block by block; Gaussians without evidence have the direction 0.
 
-    Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median of the features of the
-    remaining views by cosine distance. It is computed by Weiszfeld iterations with weights evidence / (1 - cosine), and
-    is normalized to length 1 after each iteration.
+    Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median, by cosine distance, of
+    the features in the remaining views. It is computed by Weiszfeld iterations with weights evidence / (1 - cosine),
+    and is normalized to length 1 after each iteration.
 
     Args:
         gaussians: Indices of the Gaussians (default: all).
@@ -251,7 +251,7 @@ def iter_medians(
 
 
 def _visible(row: Tensor, view: Tensor, weight: Tensor, count: int, views: int) -> Bool[Tensor, " nnz"]:
-    """Return a mask of the entries in views in which the Gaussian has at least `VISIBLE` times its largest weight."""
+    """Return a mask of the entries in views where the Gaussian has at least `VISIBLE` times its largest weight."""
     keys, group = (row * views + view).unique(return_inverse=True)
     view_weight = weight.new_zeros(len(keys)).index_add_(0, group, weight)
     heaviest = weight.new_zeros(count).scatter_reduce_(0, keys // views, view_weight, "amax")
@@ -278,8 +278,8 @@ def dense_sums(
 ) -> Float[Tensor, "n d"]:
     """Return sum_i A_ij B_i of every Gaussian j over the pixels i of all views, with the compositing weights A_ij.
 
-    The sum is the gradient of gsplat's render with respect to the colors, if B is the gradient with respect to the
-    render. Each view needs one forward pass, and one backward pass per 32 channels.
+    The sum is the gradient of a loss with respect to the colors if B is its gradient with respect to gsplat's render.
+    Each view needs one forward pass, and one backward pass per 32 channels.
 
     Args:
         maps: Feature B_i of every pixel, for each view.

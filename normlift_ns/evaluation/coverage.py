@@ -122,7 +122,7 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
 
 
 _HIDDEN_SHARE = 0.01
-"""Share of the total surface (see `GaussianEvidence`) that is ignored, in the Gaussians with the smallest surface."""
+"""Maximum share of the total surface (see `GaussianEvidence`) in the smallest Gaussians, which are ignored."""
 _MIN_SHARE = 0.001
 """Minimum share of the total surface (see `GaussianEvidence.surface`) in a listed region."""
 _MAX_REGIONS = 20
@@ -150,15 +150,15 @@ class WeakRegion:
     A view that hardly shows Gaussian j has little influence on R_j(S).
     """
     lifted_reliability: float
-    """Mean of the reliability R from the lift, in 0..1, which uses all views in which a Gaussian has weight."""
+    """Mean of the reliability R of the lift, in 0..1. R includes views that hardly show a Gaussian."""
     norm: float
     """Mean ||f|| of the Gaussians with evidence, in 0..1, or 0 if none has evidence. A low value means that the views
     disagree, so more views of the same kind may not help."""
     views: float
     """Mean number of lifted views in which a Gaussian has at least a tenth of s_j."""
     unsupported: float
-    """Share of the region, by s_j, whose Gaussians voting cannot repair, because neither they nor their neighbors have
-    R > 0."""
+    """Share of the region, weighted by s_j, that voting cannot repair because neither the Gaussians nor their neighbors
+    have R > 0."""
 
 
 class GaussianEvidence(NamedTuple):
@@ -346,7 +346,7 @@ def model_of_lift(
 
 
 def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Tensor, " views"]:
-    """Return gain(v) of every view v, the increase of the mean reliability if v is lifted in addition."""
+    """Return gain(v) of every view v, the increase of the mean reliability if v is added to the lift."""
     before = model.reliability(model.weight, model.squared)
     rise = torch.zeros(count, dtype=torch.float64, device=before.device)
     parts = (x.split(_CHUNK) for x in (views.row_index(), views.column, views.weight))
@@ -432,8 +432,8 @@ class Pose:
 
     camera: Camera
     gain: float
-    """Expected increase of the mean reliability of all surfaces if an image from this pose is lifted in addition to the
-    previous poses. Only Gaussians in weak regions contribute."""
+    """Expected increase of `Coverage.reliability` if an image from this pose is added to the lift, after images from
+    the previous poses. Only Gaussians in weak regions contribute."""
     regions: list[int]
     """Numbers of the weak regions that the pose shows; region 1 is the first in `Coverage.regions`."""
     shown: float
@@ -459,7 +459,7 @@ class FreeSpace:
     up: Float64[Tensor, " 3"]
     cameras: Sequence[Camera]
     depths: Sequence[Float64[Tensor, "h w"]]
-    """Depth of every pixel of each of the `cameras`, infinite for empty pixels."""
+    """Depth of every pixel of each camera in `cameras`; infinite for empty pixels."""
 
     @property
     def depth(self) -> float:
@@ -485,7 +485,7 @@ class FreeSpace:
 
 
 def free_space(drawn: RasterInputs, cameras: Sequence[Camera]) -> FreeSpace:
-    """Compute the free space from the positions of all cameras and the depths of evenly spaced ones."""
+    """Compute the free space from the positions of all cameras and the rendered depths of some of them."""
     chosen = [_with_pixels(cameras[i], _DEPTH_PIXELS) for i in sample_evenly(len(cameras), _DEPTH_VIEWS)]
     to_world = torch.stack([camera.world_to_camera.double().cpu().inverse() for camera in cameras])
     up = normalize(-to_world[:, :3, 1].mean(0), dim=0)
@@ -586,7 +586,7 @@ def suggest_poses(
 
 
 def _regions_shown(shown: Float64[Tensor, "p v"], view: int) -> list[int]:
-    """Return the numbers of the regions that a view shows, counted from 1."""
+    """Return the 1-based numbers of the regions that a view shows."""
     return [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= MIN_SHOWN_SHARE]
 
 
@@ -699,8 +699,7 @@ class SuggestedImage:
     why: LeftOutReason
     """Reason why the image was not lifted."""
     gain: float
-    """Expected increase of the mean reliability of all surfaces if the image is lifted in addition to the previous
-    images."""
+    """Expected increase of `Coverage.reliability` if the image is added to the lift, after the previous images."""
     regions: list[int]
     """Numbers of the weak regions that the image shows; region 1 is the first in `Coverage.regions`."""
 
@@ -747,7 +746,7 @@ class Coverage:
         `ns-render camera-path` renders the camera path with the run.
 
         Args:
-            overwrite: Replace existing files.
+            overwrite: Replace existing files, and remove those of an earlier study.
         Raises:
             FileExistsError: If a file exists and `overwrite` is False.
             ValueError: If the path is not a file name, or a file of the run would be replaced.

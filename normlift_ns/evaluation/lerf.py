@@ -124,7 +124,7 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
 
 
 def _points(segmentation: Sequence[_Point], width: int, height: int) -> np.ndarray:
-    """Return the points of a polygon. Raise InputError if a point is outside by more than the size of the image."""
+    """Return the points of a polygon; raise InputError if one is more than an image width or height out of bounds."""
     points = np.array(segmentation, dtype=float)
     distance = np.abs(points / (width, height) - 0.5)
     if distance.max() > 1.5:
@@ -143,9 +143,9 @@ def match_views(files: Sequence[Path], names: Sequence[str]) -> tuple[dict[Path,
     """Match label files with images by their stems.
 
     Returns:
-        The image of every label file with an image, and the stems of the other label files.
+        The image of every label file that matches one, and the stems of the other label files.
     Raises:
-        ValueError: If no label file has an image, or a label file has several images.
+        ValueError: If no label file matches an image, or a label file matches several images.
     """
     images: dict[str, list[str]] = {}
     for name in names:
@@ -203,7 +203,7 @@ def prompt_mask(
             relevancy to 0..1 over the image. They select a pixel if most of the pixels around it exceed 0.7, which
             LangSplat writes as 2 x - 1 > 0.4.
         margin: Lead over the background words, in cosine.
-        instances: True number of instances in the frame.
+        instances: True number of instances of the prompt in the frame.
     """
     if masking == "background":
         return score > background.max(dim=2).values + margin

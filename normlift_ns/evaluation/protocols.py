@@ -171,7 +171,7 @@ class EvaluatedRun:
     """Folder of the lift's cache of 2D features, or None without a cache."""
 
     def cosine(self, names: Sequence[str]) -> Float[Tensor, "n q"]:
-        """Return the cosine between every Gaussian's direction and each prompt, or 0 without a direction."""
+        """Return the cosine between every Gaussian's direction and each prompt; 0 for Gaussians without a direction."""
         return self.field.query(self.texts.text(names), refined=self.refined).float()
 
     @property
@@ -195,7 +195,7 @@ class EvaluatedRun:
         """Return the length of the composited feature vector of every pixel, for each camera.
 
         Args:
-            factor: Factor of all directions, or of each direction, before compositing.
+            factor: Factor for all directions, or one per direction, to apply before compositing.
         """
         squares = [torch.zeros(camera.height, camera.width, dtype=torch.float64) for camera in cameras]
         for axes in torch.eye(self.field.dimension).split(_CHANNELS):
@@ -217,7 +217,7 @@ Rasterize = Callable[..., Evidence]
 def rasterizer(scene: Scene, settings: RasterSettings | None, gaussians: GaussianScene | None = None) -> Rasterize:
     """Return `rasterize_evidence` with the Gaussians and the mode of a scene as fixed arguments.
 
-    `gaussians` replaces the Gaussians of the scene, for example by a copy on another device.
+    `gaussians` replaces the Gaussians of the scene, for example with a copy on another device.
     """
     gaussians = scene.gaussians if gaussians is None else gaussians
     return partial(rasterize_evidence, gaussians, rasterize_mode=scene.rasterize_mode, settings=settings)

@@ -145,14 +145,14 @@ TABLES: Mapping[str, PublishedTable] = {
 def compare_with_paper(
     evaluation: Evaluation, studies: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return the comparable tables of the paper, with the results of the evaluation in the column `yours`.
+    """Return the paper's tables for an evaluation and its studies, with their results in the column `yours`.
 
     Args:
         evaluation: Result of --protocol scannet or lerf. As in the paper, the studies ablation and signals are for
             scannet, and timing is for lerf.
         studies: Rows of each study, by its name.
     Returns:
-        Rows of each table, by its title. `yours` is NaN if the evaluation lacks the number, and `difference` is `yours`
+        Rows of each table, by table title. `yours` is NaN if the evaluation lacks the number. `difference` is `yours`
         minus the paper's number for NormLift.
 
     >>> rows = compare_with_paper(Evaluation({"miou_19": 0.3}, [], {"protocol": "scannet"}), {})

@@ -171,7 +171,7 @@ def evaluate_scannet(scenes: Sequence[SceneLabels], options: ScannetOptions) -> 
 
 
 def _class_rows(scene: str, classes: int, scores: ClassScores) -> list[dict[str, Any]]:
-    """Return the scores of each class that the truth of a scene contains."""
+    """Return the scores of each class in the ground truth of a scene."""
     return [
         {"scene": scene, "classes": classes, "class": NYU40[i], "iou": iou, "accuracy": accuracy}
         for i, iou, accuracy in zip(CLASS_SETS[classes], scores.iou.tolist(), scores.accuracy.tolist())

@@ -81,10 +81,10 @@ def _otsu(counts: Int64[Tensor, " bins"], edges: Float[Tensor, " edges"]) -> flo
 
 
 def clean_mask(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Open and close a mask by 3 x 3 pixels, keep the largest 8-connected component, and fill its holes.
+    """Open and close a mask with a 3 x 3 square, keep the largest 8-connected component, and fill its holes.
 
-    The first of several equal components is kept. Pixels outside the image are empty in every step, so the outermost
-    rows and columns of the result are empty.
+    The first of several equally large components is kept. Pixels outside the image are empty in every step, so the
+    outermost rows and columns of the result are empty.
     """
     image, square = mask.cpu().numpy().astype(np.uint8), np.ones((3, 3), np.uint8)
     for step in (cv2.erode, cv2.dilate, cv2.dilate, cv2.erode):

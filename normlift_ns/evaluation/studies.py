@@ -299,11 +299,11 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
 
     The groups are `all`, `zero` (R = 0) and `seen` (R > 0), as in the paper's table of zero-evidence Gaussians. Each
     has its `.share` of all Gaussians, the mean `.opacity`, the share of `.faint` Gaussians and the mean number of
-    `.views`. With ground truth, it also has `.accuracy_unrefined` and, after a vote, `.accuracy_refined`.
+    `.views`. With ground truth, each also has `.accuracy_unrefined` and, after a vote, `.accuracy_refined`.
 
     Opacity is compared with R for Gaussians with R > 0. `opacity.spearman` and `opacity.kendall` are correlations, with
     p-values `…_p`. `opacity.jaccard` is the Jaccard index of the fifth with the lowest R and the fifth with the lowest
-    opacity. `opacity.quintile1` … are mean opacities by ascending R.
+    opacity. `opacity.quintile1` … are mean opacities in fifths of ascending R.
 
     With ground truth, `reliability.bin1` … are the accuracies of unrefined predictions in ten bins of equal count by R.
     `norm.bin1` … are those by ||f||. `….spearman_bins` is their rank correlation with the bin number. `histogram.0.00`
@@ -356,7 +356,7 @@ def _correct_predictions(scenes: Sequence[SceneSignals]) -> tuple[Bool[Tensor, "
 
 
 def accuracy_bins(key: Float[Tensor, " n"], correct: Bool[Tensor, " n"], bins: int = 10) -> list[float]:
-    """Return the share of correct predictions in bins of equal count by the key. Rows with a key <= 0 are ignored."""
+    """Return the share of correct predictions in bins of equal count by the key, for Gaussians with a key > 0."""
     positive = key > 0
     return list(_bins(key[positive], correct[positive].double(), bins))
 

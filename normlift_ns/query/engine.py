@@ -238,7 +238,7 @@ class Finding:
 
     @property
     def extent(self) -> list[float] | None:
-        """Size of the box that contains the central 90% of the selected centers along each axis."""
+        """Distance from the 5th to the 95th percentile of the selected centers along x, y and z."""
         return self._selection.extent
 
     @property
@@ -328,7 +328,7 @@ class SelectionStats(NamedTuple):
     centroid: list[float] | None
     """Weighted mean of the centers of the selected Gaussians, [x, y, z]."""
     extent: list[float] | None
-    """Size of the box that contains the central 90% of the selected centers along each axis."""
+    """Distance from the 5th to the 95th percentile of the selected centers along x, y and z."""
     mean_reliability: float | None
     """Weighted mean of the reliability R over the selected Gaussians."""
 

@@ -164,7 +164,7 @@ class SegmentationResult(NamedTuple):
     """Minimum reliability R of a selected Gaussian, in 0..1."""
 
     def selected(self, text: int) -> Bool[Tensor, " n"]:
-        """Return a mask of the reliable Gaussians with more than half of their weight inside the masks of SAM 3."""
+        """Return a mask of the sufficiently reliable Gaussians with most of their weight inside the SAM 3 masks."""
         answer = self.answers[text]
         return answer.mask & (answer.scalars.reliability >= self.min_reliability)
 

@@ -98,7 +98,7 @@ def _extents(
     """Return, for each prompt, the distance along each axis between the quantiles `_CENTRAL` of the chosen centers.
 
     Args:
-        ascending: Coordinates of all centers in ascending order and the index of each Gaussian, one pair per axis.
+        ascending: Sorted coordinates of all centers and the indices that sort them, one pair per axis.
     """
     extents = []
     for values, order in ascending:
