@@ -217,7 +217,7 @@ def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: T
 
 
 def _summed(evidence: Evidence, rows: Tensor) -> Evidence:
-    """Return the sum of the evidence of the Gaussians `rows` as one row; repeated Gaussians count repeatedly."""
+    """Return the sum of the evidence of the Gaussians `rows` as one row; duplicates in `rows` count several times."""
     parts = []
     for matrix, columns in ((evidence.rows, evidence.num_regions), (evidence.unlabeled, evidence.num_views)):
         selected = matrix.select_rows(rows)

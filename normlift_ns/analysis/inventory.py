@@ -57,7 +57,7 @@ _MANY_WORDS = 100
 _FALSE_NAMES = 0.25
 """Expected number of wrong names that the test allows."""
 _SAMPLE = 5000
-"""Approximate number of Gaussians in the sample of the scene with which names are compared."""
+"""Approximate number of sampled Gaussians over which the cosines of each word are standardized; see `best_words`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class Vocabulary:
         encode: Callable[[Sequence[str]], Float[np.ndarray, "w d"]],
         ask: Callable[[Sequence[str]], Any],
     ) -> Vocabulary:
-        """Return a vocabulary without duplicates for the encoder with this name.
+        """Return a vocabulary without duplicates for the encoder with the name `encoder`.
 
         Raises:
             ValueError: A word is empty, or the encoder cannot encode it.

@@ -427,7 +427,7 @@ class Catalogue:
         return "capture unit" if self.meters_per_unit is None else "metre"
 
     def to_json(self) -> dict[str, Any]:
-        """Return all values as plain Python types."""
+        """Return all values except `view_shares` as plain Python types."""
         return {
             "unit": self.unit,
             "metres_per_unit": self.meters_per_unit,
@@ -709,8 +709,8 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
 def _isolation(scene: GaussianScene, rows: Tensor) -> Float[Tensor, " m"]:
     """Return the first term of the score, log2(d / (s + s')).
 
-    Here, d is the distance to the eighth nearest neighbor, and s is the largest scale of the Gaussian. s' is the median
-    of the largest scales of the eight neighbors.
+    Here, d is the distance to the eighth nearest neighbor in `rows`, and s is the largest scale of the Gaussian. s' is
+    the median of the largest scales of the eight neighbors.
     """
     count = min(_FLOATER_NEIGHBORS, len(rows) - 1)
     neighbors = nearest_neighbors(scene.means[rows], count)

@@ -396,7 +396,7 @@ def visible_shares(views: SparseRows, count: int, surface: Tensor, parts: Sequen
 
 
 def _ratio(numerator: Float[Tensor, "*n"], denominator: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Divide two arrays, with 0 for a denominator of 0."""
+    """Divide two tensors, with 0 for a denominator of 0."""
     return torch.where(denominator > 0, numerator / denominator, 0.0)
 
 

@@ -27,7 +27,7 @@ class PublishedTable:
 
 
 def _numbers(metrics: Sequence[str], rows: Mapping[str, Sequence[float]]) -> Numbers:
-    """Return the numbers of rows with one value for each metric."""
+    """Return the numbers of a table from its rows, which have one value per metric."""
     return {(row, metric): value for row, values in rows.items() for metric, value in zip(metrics, values)}
 
 
@@ -148,8 +148,8 @@ def compare_with_paper(
     """Return the paper's tables for an evaluation and its studies, with their results in the column `yours`.
 
     Args:
-        evaluation: Result of --protocol scannet or lerf. As in the paper, the studies ablation and signals are for
-            scannet, and timing is for lerf.
+        evaluation: Result of --protocol scannet or lerf. As in the paper, the studies ablation and signals are compared
+            only for scannet, and timing only for lerf.
         studies: Rows of each study, by its name.
     Returns:
         Rows of each table, by table title. `yours` is NaN if the evaluation lacks the number. `difference` is `yours`

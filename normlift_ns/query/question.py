@@ -89,7 +89,7 @@ class Query:
     min_reliability: float = 0.0
     """Minimum reliability R of a selected Gaussian, in 0..1."""
     refined: bool = True
-    """Use refined features."""
+    """Use refined directions."""
     encoder: str | None = None
     """Digest of the encoder that computed the embeddings, from `encoder_digest`; None if unknown."""
     suggest_threshold: bool = False
@@ -134,7 +134,7 @@ def make_query(
             None is the threshold of `default_rule` for the default rule of the field. For other rules, it is that of
             `RELEVANCY_RULES` if the rule needs negatives, else "auto", because no threshold suits all encoders.
         min_reliability: Minimum reliability R of a selected Gaussian, in 0..1.
-        refined: Use refined features.
+        refined: Use refined directions.
     Raises:
         ValueError: An argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
     """

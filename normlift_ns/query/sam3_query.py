@@ -1,7 +1,7 @@
 """Lift of SAM 3 masks, with two regions per prompt and view: inside and outside the mask.
 
 The relevancy of a Gaussian for a prompt is the fraction of its weight inside the masks of the voting views, sum_v E_in
-/ sum_v (E_in + E_out). The weights are those of the rasterizer that trained the scene.
+/ sum_v (E_in + E_out). The weights are those of the rasterizer with which the scene was trained.
 
 The mask of a whole view can be wrong, because SAM 3 misses an object or confuses it with another one. Two rounds
 therefore determine the voting views. In the first round, all views in which SAM 3 found the prompt vote. In the second
@@ -9,8 +9,8 @@ round, a view votes if the weighted intersection over union of its mask and the 
 exceeds one half. It also votes if both are empty. If SAM 3 found the prompt in none of these views, the result is that
 of the first round.
 
-All pixels of a view that does not vote are unlabeled. The lift counts them with `unlabeled="dilute"`, so they lower
-the reliability of the Gaussians that they show. Agreement and reliability are those of `core.lift` for two regions per
+All pixels of a view that does not vote are unlabeled. The lift counts them with `unlabeled="dilute"`, so they lower the
+reliability of the Gaussians that they show. Agreement and reliability are those of `core.lift` for two regions per
 view, inside and outside, with the features (1, 0) and (0, 1).
 """
 
@@ -128,7 +128,7 @@ def mask_evidence(
         valid_pixels: Mask of the pixels to use in each view; None for all pixels.
         options: `rasterize_mode` and `settings` of `rasterize_evidence`.
     Raises:
-        ValueError: There are no cameras, or the masks do not match the number or size of the cameras.
+        ValueError: There are no cameras or prompts, or the masks do not match the cameras in number or size.
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(
