@@ -306,10 +306,10 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
     opacity. `opacity.quintile1` … are mean opacities in fifths of ascending R.
 
     With ground truth, `reliability.bin1` … are the accuracies of unrefined predictions in ten bins of equal count by R.
-    `norm.bin1` … are those by ||f||. `….spearman_bins` is their rank correlation with the bin number. `histogram.0.00`
-    … are shares of all Gaussians, in bins of R > 0.
+    `norm.bin1` … are those by ||f||. `….spearman_bins` is their rank correlation with the bin number.
 
-    The p-values assume that Gaussians are independent, but neighbors are not independent.
+    `histogram.0.00` … are shares of all Gaussians in bins of R, in which Gaussians with R = 0 are not counted. The
+    p-values assume that Gaussians are independent, but neighbors are not independent.
     """
     reliability, norm, views = (
         torch.cat([getattr(scene.scalars, name) for scene in scenes]) for name in ("reliability", "norm", "view_count")
