@@ -58,7 +58,7 @@ class RegionVote:
     share: float
     """Weight in this region as a fraction of the weight in the whole image, in 0..1."""
     agreement: float
-    """Cosine of the region's feature to the direction of the selection."""
+    """Cosine between the region's feature and the direction of the selection."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class ViewVote:
     disagreement: float
     """Fraction of the total disagreement that comes from this image, in 0..1; 0 if all images agree."""
     regions: tuple[RegionVote, ...]
-    """Regions by descending weight; together they have at least 90 % of the image's weight."""
+    """Regions by descending weight, which together have at least 90% of the image's weight."""
 
 
 @check_arguments
@@ -100,19 +100,19 @@ class Why:
     gaussians: int
     """Number of selected Gaussians."""
     changed: float
-    """Share of the selected Gaussians whose direction the vote changed, in 0..1, estimated from at most 4,096 of them.
-    A direction counts as changed if its cosine with the direction before the vote is below 0.98."""
+    """Share of the selected Gaussians whose direction the vote of their neighbors changed, in 0..1, estimated from
+    at most 4,096 of them. A direction counts as changed if its cosine with the previous direction is below 0.98."""
     norm: float
     c_intra: float
     c_inter: float
     n_eff: float
     reliability: float
-    """R of the selection. This number, `norm`, `c_intra`, `c_inter` and `n_eff` treat the selection as one Gaussian."""
+    """R of the selection. For R, `norm`, `c_intra`, `c_inter` and `n_eff`, the selection counts as one Gaussian."""
     views: tuple[ViewVote, ...]
     """Votes of the images with weight > 0, by descending weight."""
     copied: int = 0
-    """Number of selected Gaussians that use the direction of another one. This value of version 0.2 will be removed.
-    Use `changed` instead."""
+    """Number of selected Gaussians that use the direction of another Gaussian. This value of version 0.2 will be
+    removed. Use `changed` instead."""
 
     @property
     def most_different(self) -> tuple[ViewVote, ...]:
@@ -121,9 +121,9 @@ class Why:
         return tuple(sorted(votes, key=lambda vote: -vote.disagreement))
 
     def images_to_show(self, count: int = 3) -> tuple[tuple[ViewVote, ...], tuple[ViewVote, ...]]:
-        """Return the images with the largest weight, and others that disagree, at most `count` of each.
+        """Return the votes of the images with the largest weights and of others that disagree, at most `count` of each.
 
-        An image disagrees if its vote has a cosine below 0.9 to the sum of all votes.
+        An image disagrees if the cosine between its vote and the sum of all votes is below 0.9.
         """
         heaviest = self.views[:count]
         others = [one for one in self.most_different if one.agreement < _MIN_AGREEMENT and one not in heaviest]
@@ -131,7 +131,7 @@ class Why:
 
     @property
     def words(self) -> str:
-        """Agreement of the images and their effective number, as English sentences.
+        """Agreement and effective number of the images, as English sentences.
 
         >>> Why(5, 0.0, 0.9, 1.0, 0.97, 3.2, 0.7, ()).words
         'The images agree (C_inter 0.97). Their weights are equivalent to 3.2 images of equal weight (N_eff).'
@@ -146,7 +146,7 @@ class Why:
 
     @property
     def sentence(self) -> str:
-        """`words`, and a sentence about the share of directions that the vote changed, unless it is 0."""
+        """`words`, followed by a sentence about the share of changed directions, unless the share is 0."""
         if self.changed == 0:
             return self.words
         share = "less than 1%" if self.changed < 0.01 else f"{self.changed:.0%}"
@@ -159,7 +159,7 @@ class Why:
 
 _MIN_AGREEMENT = 0.9
 _COMPARED = 4096
-"""Largest number of Gaussians whose directions before and after the vote are compared."""
+"""Maximum number of Gaussians whose directions before and after the vote are compared."""
 _LEVELS = (
     (0.95, "agree"),
     (0.85, "agree with few exceptions"),
@@ -207,7 +207,7 @@ def explain_selection(
 
 
 def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: Tensor) -> float:
-    """Return the share of pairs (rows[i], origin[i]) whose directions differ, from at most `_COMPARED` of the pairs."""
+    """Estimate the share of pairs (rows[i], origin[i]) whose directions differ, from at most `_COMPARED` pairs."""
     step = -(-len(rows) // _COMPARED)
     rows, origin = rows[::step], origin[::step]
     other, table = rows != origin, torch.nn.functional.normalize(features.to(rows.device).float(), dim=1)
@@ -217,7 +217,7 @@ def _changed_share(evidence: Evidence, features: Tensor, rows: Tensor, origin: T
 
 
 def _summed(evidence: Evidence, rows: Tensor) -> Evidence:
-    """Return the sum of the evidence of the Gaussians `rows` as one row; repeated Gaussians count repeatedly."""
+    """Return the sum of the evidence of the Gaussians `rows` as one row; duplicates in `rows` count several times."""
     parts = []
     for matrix, columns in ((evidence.rows, evidence.num_regions), (evidence.unlabeled, evidence.num_views)):
         selected = matrix.select_rows(rows)
@@ -230,7 +230,7 @@ def _summed(evidence: Evidence, rows: Tensor) -> Evidence:
 
 
 def _votes(joined: Evidence, table: Float64[Tensor, "r d"]) -> tuple[ViewVote, ...]:
-    """Return one vote per image, from evidence with a single row and the features of the entries of that row."""
+    """Return the votes of the images with weight > 0, from evidence with one row and the feature of each entry."""
     column, weight = joined.rows.column.long(), joined.rows.weight
     view = joined.region_view[column].long()
     total = torch.zeros(joined.num_views, dtype=torch.float64, device=weight.device).index_add_(0, view, weight)
@@ -299,7 +299,7 @@ def _eroded(masks: Bool[Tensor, "r h w"], width: int) -> Bool[Tensor, "r h w"]:
 
 
 _FEATURE_TOLERANCE = 1e-3
-"""Maximum difference between the numbers of a stored feature and of the same feature after recomputation."""
+"""Maximum difference between a component of a stored feature and the same component after recomputation."""
 
 
 class VoteImage(NamedTuple):
@@ -360,7 +360,7 @@ class RecordedVotes:
         return explain_selection(evidence, features, selected, source=source, beta=beta, unlabeled=unlabeled)
 
     def pictures(self, votes: Iterable[ViewVote]) -> Iterator[VoteImage]:
-        """Yield the images one after another, with outlines of the regions that voted.
+        """Yield the image of each vote, with outlines of the regions that voted.
 
         Raises:
             FileNotFoundError: An image no longer exists.

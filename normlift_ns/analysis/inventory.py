@@ -1,20 +1,20 @@
-"""Objects of a scene without prompts: parts whose Gaussians share regions in the images.
+"""Objects of a scene, found without prompts: parts whose Gaussians share regions in the images.
 
-Two neighboring Gaussians get a count from each image in which both have a region. The count is 1 if both have the same
+Two neighboring Gaussians get a score from each image in which both have a region. The score is 1 if both have the same
 region. Otherwise, it is the similarity of the two regions, max(0, 1 - (1 - cos) / (3 s)). Here, s measures how much
-the views usually disagree. It is the mean of 1 - median ||f_j|| before and after the consensus, with f_j the mean
-feature of Gaussian j. The affinity of two parts is the mean of the counts over all images and all pairs of neighbors
-across their border::
+the views typically disagree. It is the mean of 1 - median ||f_j|| before and after the consensus, with f_j the mean
+feature of Gaussian j. The affinity of two parts is the mean of the scores over all images and all pairs of neighbors
+across their border, reduced if there are few scores::
 
-    a(A, B) = sum of counts / max(number of counts, m sqrt(min(|A|, |B|)))
+    a(A, B) = sum of scores / max(number of scores, m sqrt(min(|A|, |B|)))
 
 Here, m is the median number of images per pair. The square root estimates the length of the border, which is a line on
 a surface. This denominator keeps two parts separate if only a few pairs connect them. Initially, every Gaussian is a
-part. Each part joins the part with the largest affinity if that part is larger. This is repeated for affinities of at
-least 0.95, then 0.9, and so on down to 0.5. The method corresponds to the ultrametric contour map of Arbelaez et al.
-("Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of edge strengths.
-Random borders of a segmentation differ between images, so the affinity across them is high. Borders of objects are the
-same in all images, so the affinity across them is low.
+part. Each part is merged into the part with the largest affinity to it if that part is larger. This is repeated for
+affinities of at least 0.95, then 0.9, and so on down to 0.5. The method corresponds to the ultrametric contour map of
+Arbelaez et al. ("Contour Detection and Hierarchical Image Segmentation", PAMI 2011), with votes of regions in place of
+edge strengths. Random borders of a segmentation differ between images, so the affinity across them is high. Borders of
+objects are the same in all images, so the affinity across them is low.
 """
 
 from __future__ import annotations
@@ -47,25 +47,25 @@ _NEIGHBORS = 8
 _MIN_VISIBLE = 0.25
 """Minimum weight of a Gaussian in an image that shows it, as a fraction of its largest weight in any image."""
 _MIN_REGION = 0.25
-"""Minimum weight of a Gaussian in its region of an image, as a fraction of its weight in this image over all levels."""
+"""Minimum weight of a Gaussian in its region of an image, as a fraction of its weight in the image over all levels."""
 _SPREADS = 3.0
-"""Disagreement of two regions at which their similarity is 0, as a multiple of the usual disagreement."""
+"""Disagreement of two regions at which their similarity is 0, as a multiple of the typical disagreement s."""
 _LEVELS = tuple(level / 20 for level in range(19, 9, -1))
-"""Minimum affinities of the successive rounds of joining, from 0.95 to 0.5."""
+"""Minimum affinities of the successive rounds of merging, from 0.95 to 0.5."""
 _MANY_WORDS = 100
 """Minimum number of words for the test of names against chance."""
 _FALSE_NAMES = 0.25
 """Expected number of wrong names that the test allows."""
 _SAMPLE = 5000
-"""Approximate number of Gaussians in the sample of the scene with which names are compared."""
+"""Approximate number of sampled Gaussians over which the cosines of each word are standardized; see `best_words`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Inventory:
-    """Main objects of a scene, by descending evidence: large objects and those that many images show are first."""
+    """Main objects of a scene, by descending evidence: large objects and those that many images show come first."""
 
     instance_id: Int32[Tensor, " n"]
-    """Number of the object of every Gaussian, from 1; 0 for Gaussians without an object."""
+    """Object number of every Gaussian, from 1; 0 for Gaussians without an object."""
     catalog: Catalogue
     """Catalog of the objects. The text of an object is a word of the vocabulary, or a numbered name such as "object 3";
     see `name_objects`."""
@@ -93,9 +93,9 @@ class Vocabulary:
     kind: EncoderKind | None
     """Kind of the encoder of the run; None if it is unknown."""
     encode: Callable[[Sequence[str]], Float[np.ndarray, "w d"]]
-    """Function from words to unit vectors."""
+    """Function that returns one unit vector per word."""
     ask: Callable[[Sequence[str]], Any]
-    """Function from words to the `Answer` of a query."""
+    """Function that returns the `Answer` to a query for the words."""
 
     @classmethod
     def of(
@@ -105,7 +105,7 @@ class Vocabulary:
         encode: Callable[[Sequence[str]], Float[np.ndarray, "w d"]],
         ask: Callable[[Sequence[str]], Any],
     ) -> Vocabulary:
-        """Return a vocabulary without duplicates for the encoder with this name.
+        """Return a vocabulary without duplicates for the encoder with the name `encoder`.
 
         Raises:
             ValueError: A word is empty, or the encoder cannot encode it.
@@ -129,7 +129,7 @@ class ViewRegions(NamedTuple):
 
 
 class _Borders(NamedTuple):
-    """Pairs of parts that touch, with the sum and the number of counts across their border."""
+    """Pairs of adjacent parts, with the sum and the number of the scores across their border."""
 
     first: Int64[np.ndarray, " e"]
     second: Int64[np.ndarray, " e"]
@@ -137,7 +137,7 @@ class _Borders(NamedTuple):
     observed: Float64[np.ndarray, " e"]
 
     def joined(self, part: Int64[np.ndarray, " n"]) -> _Borders:
-        """Return the borders after joining parts; `part[i]` is the new number of part i."""
+        """Return the borders after merging parts; `part[i]` is the new index of part i."""
         first, second = part[self.first], part[self.second]
         keep = first != second
         low, high = np.minimum(first, second)[keep], np.maximum(first, second)[keep]
@@ -154,11 +154,11 @@ def list_inventory(
     meters_per_unit: float | None = None,
     device: str = "cpu",
 ) -> Inventory:
-    """Find the main objects of a scene, name them, and list them.
+    """Find and name the main objects of a scene, and return them with their catalog.
 
     Args:
         votes: Evidence of the lift, with its scene and its field.
-        vocabulary: Candidate names. If none of them fits an object, its name is "object" and its number.
+        vocabulary: Candidate names. An object that none of them fits is named by its number, such as "object 3".
         transform, meters_per_unit, device: As in `make_catalogue`.
     Raises:
         ValueError, FileNotFoundError: As in `RecordedVotes.table` and `make_catalogue`.
@@ -186,7 +186,7 @@ def find_inventory(
     Args:
         features: One unit row per column (region) of the evidence.
         means: Centers of the Gaussians.
-        spread: Usual disagreement of the views about a Gaussian, `RecordedVotes.disagreement`.
+        spread: Typical disagreement of the views about a Gaussian, from `RecordedVotes.disagreement`.
     """
     evidence = evidence.to("cpu")
     part = _join(len(means), _neighbor_borders(view_regions(evidence), features.cpu(), means.cpu(), spread))
@@ -201,7 +201,7 @@ def find_inventory(
 
 
 def view_regions(evidence: Evidence) -> Iterator[ViewRegions]:
-    """Yield, for each image, the Gaussians that it shows and their regions."""
+    """Yield, for each image, the Gaussians that it shows and the region in which each has its largest weight."""
     rows, groups, view = evidence.rows, evidence.view_group_offsets, evidence.region_view.long()
     weight, column, gaussian = rows.weight.double(), rows.column.long(), rows.row_index()
     total = SparseRows.add(evidence.view_weights(), evidence.unlabeled)
@@ -225,7 +225,7 @@ def view_regions(evidence: Evidence) -> Iterator[ViewRegions]:
 def _neighbor_borders(
     views: Iterable[ViewRegions], features: Float[Tensor, "s d"], means: Float[Tensor, "n 3"], spread: float
 ) -> _Borders:
-    """Return the borders between every Gaussian and its nearest neighbors; each Gaussian is a separate part."""
+    """Return the borders between every Gaussian and its nearest neighbors, with each Gaussian as a separate part."""
     neighbors = nearest_neighbors(means, _NEIGHBORS).index.long()
     here = torch.arange(len(means))[:, None].expand_as(neighbors)
     low, high = torch.minimum(here, neighbors), torch.maximum(here, neighbors)
@@ -255,7 +255,7 @@ def _similarity(one: Tensor, other: Tensor, features: Tensor, spread: float) -> 
 
 
 def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
-    """Merge Gaussians into parts, and return the part of each Gaussian, numbered from 0 without gaps."""
+    """Merge Gaussians into parts, and return the index of each Gaussian's part, from 0 without gaps."""
     part, size = np.arange(num_gaussians), np.ones(num_gaussians)
     images = float(np.median(borders.observed)) if len(borders.observed) > 0 else 0.0
     for level in _LEVELS:
@@ -275,9 +275,9 @@ def _join(num_gaussians: int, borders: _Borders) -> Int64[np.ndarray, " n"]:
 def _targets(
     borders: _Borders, affinity: Float64[np.ndarray, " e"], size: Float64[np.ndarray, " n"], chosen: np.ndarray
 ) -> Int64[np.ndarray, " n"]:
-    """Return the part that each part joins: the part with the largest affinity if that part is larger, or else itself.
+    """Return the part that each part is merged into: the one with the largest affinity if it is larger, or else itself.
 
-    Only the borders with the indices `chosen` count. Ties go to the larger part, then to the part with the smaller
+    Only the borders with the indices `chosen` are used. Ties go to the larger part, then to the part with the smaller
     index. Of two equally large parts, the part with the smaller index counts as larger.
     """
     source = np.concatenate([borders.first[chosen], borders.second[chosen]])
@@ -301,7 +301,7 @@ def as_instances(instance_id: Int32[Tensor, " n"], names: tuple[str, ...]) -> In
 def mean_directions(
     evidence: Evidence, features: Float[Tensor, "s d"], instance_id: Int32[Tensor, " n"]
 ) -> Float64[Tensor, "m d"]:
-    """Return the unit mean feature of every object, weighted by evidence."""
+    """Return the evidence-weighted mean feature of every object, normalized to length 1."""
     count, rows = int(instance_id.max()) if len(instance_id) > 0 else 0, evidence.rows
     ids = instance_id.to(rows.weight.device).long()[rows.row_index()]
     key = ids * evidence.num_regions + rows.column.long()
@@ -313,10 +313,10 @@ def mean_directions(
 def name_objects(
     field: SemanticField, instance_id: Int32[Tensor, " n"], directions: Float64[Tensor, "m d"], vocabulary: Vocabulary
 ) -> tuple[str, ...]:
-    """Return the name of every object, which is a word of the vocabulary or a numbered name such as "object 3".
+    """Return a name for every object: a word of the vocabulary, or a numbered name such as "object 3".
 
     The word must be the best name and stand out from other words (see `best_words`). It must also have the verdict
-    "found", and select more than half of the object.
+    "found" and select more than half of the object's Gaussians.
 
     Args:
         directions: Unit directions of the objects, from `mean_directions`.
@@ -336,7 +336,7 @@ def name_objects(
 def _words_of_objects(
     field: SemanticField, directions: Float64[Tensor, "m d"], vocabulary: Vocabulary
 ) -> dict[int, str]:
-    """Return the best name of each object for which a word stands out, by the number of the object."""
+    """Return the best name of each object for which a word stands out, by object number."""
     words, kind = vocabulary.words, vocabulary.kind
     others = null_words() if kind is not None and kind.has_null_words and len(words) < _MANY_WORDS else ()
     compared = tuple(dict.fromkeys((*words, *others)))

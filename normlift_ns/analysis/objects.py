@@ -31,7 +31,7 @@ from normlift_ns.rasterization.rasterize import RasterOptions, rasterize_evidenc
 from normlift_ns.rasterization.settings import RasterSettings
 
 BOX_QUANTILES = (0.01, 0.99)
-"""Quantiles of the points along each axis at the two faces of a box."""
+"""Quantiles of the points along each axis that define the two faces of a box."""
 _FLAT = 1e-14
 """Points count as flat if the ratio of their smallest to their largest variance is below this value."""
 _DIRECTIONS = np.array([
@@ -68,7 +68,7 @@ class OrientedBox:
 
 
 def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
-    """Return an oriented box around the central 98 % of the points along each of its axes.
+    """Return an oriented box around the central 98% of the points along each of its axes.
 
     The axes are those of the smallest box (trimesh) around the points between the 1st and the 99th percentile along
     each of 13 directions. A few distant points therefore cannot rotate the box. Along each axis, the box extends from
@@ -93,7 +93,7 @@ def oriented_box(points: Float64[np.ndarray, "m 3"]) -> OrientedBox:
 
 
 def _central(points: Float64[np.ndarray, "m 3"]) -> np.ndarray:
-    """Return a mask of the points that are not outliers along any direction; if there are none, True for all points."""
+    """Return a mask of the points that are not outliers along any direction; if all are outliers, select all points."""
     along = points @ _DIRECTIONS.T
     low, high = np.quantile(along, BOX_QUANTILES, axis=0)
     inside = ((along >= low) & (along <= high)).all(axis=1)
@@ -101,7 +101,7 @@ def _central(points: Float64[np.ndarray, "m 3"]) -> np.ndarray:
 
 
 def _axes(points: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Return the axes of the smallest box around some points, one per row."""
+    """Return the axes of the smallest box around the points, or their principal axes if they are flat, one per row."""
     from scipy.spatial import QhullError  # noqa: PLC0415 (queries do not need it)
     from trimesh.bounds import oriented_bounds  # noqa: PLC0415
 
@@ -121,7 +121,7 @@ _NEIGHBORS = 8
 
 @dataclass(frozen=True)
 class SceneObject:
-    """Summary of one object, in scene units. Means are weighted by W_j, the weight of Gaussian j over all views."""
+    """Summary of an object in scene units. Means are weighted by W_j, the total weight of Gaussian j over all views."""
 
     size: int
     """Number of Gaussians of the object."""
@@ -178,7 +178,7 @@ def _objects(field: SemanticField, means: Tensor, selected: Tensor, ids: Tensor,
 
 
 def _large_components(means: Tensor, selected: Tensor, max_gap: float, min_gaussians: int) -> tuple[Tensor, int]:
-    """Label large connected components; return the labels (-1 outside of them) and the number of components."""
+    """Label large connected components; return the labels (-1 for other Gaussians) and the number of labels."""
     check_number("object_min_gaussians", min_gaussians, int)
     labels = connected_components(means, selected, max_gap=max_gap)
     count = int((torch.bincount(labels[labels >= 0].long()) >= min_gaussians).sum())  # sizes are in descending order
@@ -186,7 +186,7 @@ def _large_components(means: Tensor, selected: Tensor, max_gap: float, min_gauss
 
 
 def describe_object(field: SemanticField, means: Tensor, rows: Bool[Tensor, " n"]) -> SceneObject:
-    """Summarize some Gaussians as one object."""
+    """Summarize the Gaussians in `rows` as one object."""
     centers = means[rows].double().cpu().numpy()
     weight = field.scalars.weight[rows].double().cpu().numpy() + 1e-12
     reliability = field.scalars.reliability[rows].double().cpu().numpy()
@@ -343,13 +343,13 @@ def object_tables(field: SemanticField, means: Float[Tensor, "n 3"], instances: 
 MIN_VIEW_SHARE = 0.1
 """Minimum area of an object in an image that shows it, as a fraction of its largest area in any image."""
 MIN_WHOLE_FRACTION = 0.95
-"""Minimum fraction of an object inside the frame of an image that shows the whole object.
+"""Minimum fraction of an object's Gaussians inside the frame of an image that counts as showing the whole object.
 
 It is relative to the largest such fraction over the images that show the object.
 """
 MAX_BEST_VIEWS = 3
 _RENDER_SIZE = 256
-"""Longer side, in pixels, of the renders that rank images by object."""
+"""Longer side, in pixels, of the renders that measure how much of each image an object covers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,7 +362,7 @@ class SimilarityTransform:
 
     @classmethod
     def inverse_of(cls, transform: Float64[np.ndarray, "3 4"], scale: float) -> SimilarityTransform:
-        """Return the inverse of p -> scale * (transform @ p)."""
+        """Return the inverse of p -> scale * transform @ (p, 1)."""
         rotation = transform[:, :3].T
         return cls(rotation, 1 / scale, -rotation @ transform[:, 3])
 
@@ -389,15 +389,15 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class CatalogueObject:
-    """One object of a catalog; docs/objects.md explains every number."""
+    """One object of a catalog; docs/objects.md explains every value."""
 
     id: int
-    """Number of the object, the instance_id of exports."""
+    """Number of the object, which is its instance_id in exports."""
     text: str
     class_id: int
     gaussians: int
     reliability: float
-    """Mean of R, weighted by W_j, in 0..1."""
+    """Mean R of the object's Gaussians, weighted by their total weight over all views, in 0..1."""
     views: int
     """Number of training images that show the object."""
     best_views: tuple[str, ...]
@@ -411,7 +411,7 @@ class CatalogueObject:
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """Catalog of objects, ordered by prompt and by descending size."""
+    """Catalog of objects in the order of their numbers."""
 
     objects: tuple[CatalogueObject, ...]
     num_in_small_components: int
@@ -427,7 +427,7 @@ class Catalogue:
         return "capture unit" if self.meters_per_unit is None else "metre"
 
     def to_json(self) -> dict[str, Any]:
-        """Return all values as plain Python types."""
+        """Return all values except `view_shares` as plain Python types."""
         return {
             "unit": self.unit,
             "metres_per_unit": self.meters_per_unit,
@@ -503,7 +503,7 @@ def make_catalogue(
 
 
 def view_shares(scene: Scene, instances: Instances, settings: RasterSettings, device: str) -> Float[Tensor, "m v"]:
-    """Return the fraction of each of V images that each of M objects covers, in 0..1, with occlusion.
+    """Return the fraction of each of V images that each of M objects covers after occlusion, in 0..1.
 
     The fraction is the compositing weight of the object's Gaussians, averaged over the pixels of the image.
     """
@@ -634,7 +634,7 @@ def write_box_mesh(path: Path, objects: Sequence[CatalogueObject], boxes: Iterab
 
 
 def object_color(number: int) -> tuple[int, int, int]:
-    """Return an RGB color in 0..255 for an object; consecutive numbers get different hues."""
+    """Return an RGB color in 0..255 for an object number; consecutive numbers get different hues."""
     angle = 2 * np.pi * _GOLDEN_RATIO * number
     red, green, blue = (round(150 + 100 * float(np.cos(angle - shift))) for shift in (0, 2.094, 4.189))
     return red, green, blue
@@ -709,8 +709,8 @@ def find_floaters(scene: GaussianScene, scalars: Scalars, *, limit: float = FLOA
 def _isolation(scene: GaussianScene, rows: Tensor) -> Float[Tensor, " m"]:
     """Return the first term of the score, log2(d / (s + s')).
 
-    Here, d is the distance to the eighth nearest neighbor, and s is the largest scale of the Gaussian. s' is the median
-    of the largest scales of the eight neighbors.
+    Here, d is the distance to the eighth nearest neighbor in `rows`, and s is the largest scale of the Gaussian. s' is
+    the median of the largest scales of the eight neighbors.
     """
     count = min(_FLOATER_NEIGHBORS, len(rows) - 1)
     neighbors = nearest_neighbors(scene.means[rows], count)

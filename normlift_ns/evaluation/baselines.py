@@ -59,7 +59,7 @@ _BLOCK = 2**12
 
 
 def baseline_field(name: Baseline, lifted: EvaluatedRun, device: str) -> SemanticField:
-    """Lift a run again with a baseline, and return the field on the CPU without refinement.
+    """Lift a run again with a baseline, and return the unrefined field on the CPU.
 
     Raises:
         ValueError, FileNotFoundError: If the features of the run are not available (see `lifted_batches`).
@@ -105,7 +105,7 @@ def with_consensus(lifted: EvaluatedRun, enabled: bool, device: str) -> Evaluate
 def _observe_again(
     lifted: EvaluatedRun, device: str, cells: Callable[[Rasterize, GaussianScene, ViewBatch], Evidence]
 ) -> ViewObservations:
-    """Return evidence, features and levels of the regions of the lift, given a function for the evidence of cells."""
+    """Return evidence, features and levels of the regions of the lift; `cells` computes the evidence of their cells."""
     gaussians = lifted.scene.gaussians.to(device)
     rasterize = rasterizer(lifted.scene, lifted.settings, gaussians)
     views = ViewObservations.merge(
@@ -120,7 +120,7 @@ def lifted_batches(lifted: EvaluatedRun, device: str, *, max_views: int | None =
 
     Args:
         device: Device of the networks.
-        max_views: Largest number of views, evenly spaced (default: all views of the lift).
+        max_views: Maximum number of views, which are evenly spaced (default: all views of the lift).
     Raises:
         ValueError: If the run does not record its features, or the features came from a Python object or have changed.
         FileNotFoundError: If files of the features are missing.
@@ -153,7 +153,7 @@ _CELL_EVIDENCE: dict[Baseline, Callable[[Rasterize, GaussianScene, ViewBatch], E
 
 
 def _columns(block: ViewBatch) -> list[Int[Tensor, "h w"]]:
-    """Return the column of every pixel in the evidence of the block's cells, or -1 for none."""
+    """Return the column of every pixel in the evidence of the block's cells, or -1 for pixels without a cell."""
     first = torch.tensor([0, *(regions.shape[1] for regions in block.regions)]).cumsum(0).tolist()
     return [torch.where(labels >= 0, labels + start, -1) for labels, start in zip(block.labels, first)]
 
@@ -161,12 +161,13 @@ def _columns(block: ViewBatch) -> list[Int[Tensor, "h w"]]:
 def center_evidence(
     means: Float[Tensor, "n 3"], cameras: Sequence[Camera], columns: Sequence[Int[Tensor, "h w"]], evidence: Evidence
 ) -> Evidence:
-    """Return evidence as in Occam's LGS, which uses the pixel at the projected center of a Gaussian in every view.
+    """Return evidence as in Occam's LGS, which assigns a Gaussian to the pixel at its projected center in every view.
 
-    The weight is that of the Gaussian in the view.
+    The weight is that of the Gaussian in all labeled pixels of the view.
 
     Args:
-        columns: Column of every pixel in the evidence, for each view, or a negative number for none.
+        columns: Column of every pixel in the evidence, for each view; negative for pixels without a column.
+        evidence: Evidence whose rows are replaced.
     """
     weights = evidence.view_weights()
     row, view = weights.row_index(), weights.column.long()
@@ -189,7 +190,7 @@ def top_evidence(
     evidence: Evidence,
     top: int = TOP,
 ) -> Evidence:
-    """Return evidence as in Dr.Splat, which uses only the `top` Gaussians with the largest weights of every ray.
+    """Return evidence as in Dr.Splat, which uses only the `top` Gaussians with the largest weights on every ray.
 
     Args:
         rasterize: Function that computes evidence from cameras and labels.
@@ -214,7 +215,7 @@ def top_evidence(
 
 
 def _heaviest_of_rays(weights: SparseRows, pixels: int, top: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return Gaussian, pixel and weight of the `top` largest entries of every pixel."""
+    """Return the Gaussian, pixel and weight of each of the `top` largest weights in every pixel."""
     by_pixel = SparseRows.from_coo(weights.column.long(), weights.row_index(), weights.weight, pixels)
     order = by_pixel.weight.argsort(descending=True)
     order = order[by_pixel.row_index()[order].argsort(stable=True)]
@@ -228,12 +229,12 @@ def iter_medians(
 ) -> Iterator[tuple[Int[Tensor, " b"], Float[Tensor, "b d"]]]:
     """Yield (Gaussians, unit directions) as in VALA, block by block; Gaussians without evidence have the direction 0.
 
-    Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median of the features of the
-    remaining views by cosine distance. It is computed by Weiszfeld iterations with weights evidence / (1 - cosine), and
-    is normalized to length 1 after each iteration.
+    Views with a small weight are ignored (see `VISIBLE`). The direction is the geometric median, by cosine distance, of
+    the features in the remaining views. It is computed by Weiszfeld iterations with weights evidence / (1 - cosine),
+    and is normalized to length 1 after each iteration.
 
     Args:
-        gaussians: Gaussians to compute (default: all).
+        gaussians: Indices of the Gaussians (default: all).
     """
     rows = evidence.rows
     chosen = torch.arange(len(rows), device=features.device) if gaussians is None else gaussians
@@ -250,7 +251,7 @@ def iter_medians(
 
 
 def _visible(row: Tensor, view: Tensor, weight: Tensor, count: int, views: int) -> Bool[Tensor, " nnz"]:
-    """Select the entries of views in which a Gaussian has at least `VISIBLE` times its largest weight in any view."""
+    """Return a mask of the entries in views where the Gaussian has at least `VISIBLE` times its largest weight."""
     keys, group = (row * views + view).unique(return_inverse=True)
     view_weight = weight.new_zeros(len(keys)).index_add_(0, group, weight)
     heaviest = weight.new_zeros(count).scatter_reduce_(0, keys // views, view_weight, "amax")
@@ -267,7 +268,7 @@ def _weighted_sum(row: Tensor, weight: Tensor, values: Tensor, count: int) -> Te
 
 
 _TIMED_VIEWS = 6
-"""Largest number of views to time. The time of all views is extrapolated in proportion."""
+"""Maximum number of views to time. The time for all views is extrapolated in proportion to their number."""
 _CHANNELS = 32
 _ROUNDS = 3
 
@@ -277,8 +278,8 @@ def dense_sums(
 ) -> Float[Tensor, "n d"]:
     """Return sum_i A_ij B_i of every Gaussian j over the pixels i of all views, with the compositing weights A_ij.
 
-    The sum is the gradient of gsplat's render with respect to colors. Each view needs one forward pass, and one
-    backward pass per 32 channels.
+    The sum is the gradient of a loss with respect to the colors if B is its gradient with respect to gsplat's render.
+    Each view needs one forward pass, and one backward pass per 32 channels.
 
     Args:
         maps: Feature B_i of every pixel, for each view.
@@ -315,7 +316,7 @@ def timing_obstacle(lifted: EvaluatedRun, device: str) -> str | None:
 
 
 def time_dense_lift(lifted: EvaluatedRun, device: str) -> dict[str, float]:
-    """Time the methods of Splat Feature Solver and of this package, from labels and features to vectors per Gaussian.
+    """Time the methods of Splat Feature Solver and this package, from labels and features to one vector per Gaussian.
 
     Both process the same few views of the lift. Times are medians of three rounds after a warm-up round, in seconds.
     The time of Splat Feature Solver's method is also extrapolated to all views of the lift.
@@ -355,7 +356,7 @@ def _job(lifted: EvaluatedRun, device: str) -> RasterJob:
 
 
 def feature_maps(block: ViewBatch, device: torch.device | str) -> Iterable[Float[Tensor, "h w d"]]:
-    """Yield the feature of every pixel for each view, summed over levels, or 0 without a region."""
+    """Yield, for each view, the feature of every pixel, summed over levels; 0 for pixels without a region."""
     for labels, regions, features in zip(block.labels, block.regions, block.features):
         table = torch.nn.functional.pad(features.to(device), (0, 0, 1, 0))  # row 0 for pixels without a region
         cells = torch.stack([table[level.to(device).long() + 1] for level in regions]).sum(0)

@@ -42,7 +42,7 @@ from normlift_ns.rasterization.settings import RasterSettings
 
 LeftOutReason = Literal["max_views", "no features", "held out"]
 MAX_IMAGES = 256
-"""Largest number of lifted images, and of other images, that the study examines."""
+"""Maximum number of lifted images that the study examines, and maximum number of other images."""
 
 
 class _Counts(msgspec.Struct):
@@ -122,42 +122,43 @@ def study_images(scene: Scene, manifest: Mapping[str, Any]) -> StudyImages:
 
 
 _HIDDEN_SHARE = 0.01
-"""Share of the total surface whose Gaussians are ignored, because they are the smallest or most transparent."""
+"""Maximum share of the total surface (see `GaussianEvidence`) in the smallest Gaussians, which are ignored."""
 _MIN_SHARE = 0.001
-"""Smallest share of the surface in a listed region."""
+"""Minimum share of the total surface (see `GaussianEvidence.surface`) in a listed region."""
 _MAX_REGIONS = 20
-"""Largest number of listed regions."""
+"""Maximum number of listed regions."""
 
 
 @dataclass(frozen=True)
 class WeakRegion:
     """Connected visible Gaussians with little reliable evidence.
 
-    In means and shares, each Gaussian counts by its largest weight in an image, as a measure of its visible surface.
+    Means are weighted by s_j, the largest weight of Gaussian j in any image.
     """
 
     size: int
     """Number of Gaussians in the region."""
     centre: list[float]
-    """Center of the region as x, y and z, in scene units."""
+    """Mean of the Gaussian centers as x, y and z, in scene units."""
     box: dict[str, list[float]]
     """Corners "min" and "max" of the bounding box of the Gaussian centers, in scene units."""
     share: float
-    """Share of the total surface of all Gaussians that lies in the region, in 0..1."""
+    """Sum of s_j in the region as a share of the sum over all Gaussians, in 0..1."""
     reliability: float
     """Mean of R_j(S), the expected reliability with the lifted views, in 0..1.
 
-    A view that hardly shows a Gaussian has little influence on its R_j(S).
+    A view that hardly shows Gaussian j has little influence on R_j(S).
     """
     lifted_reliability: float
-    """Mean of the reliability R of the lift, in 0..1. R counts all views in which a Gaussian has weight."""
+    """Mean of the reliability R of the lift, in 0..1. R includes views that hardly show a Gaussian."""
     norm: float
     """Mean ||f|| of the Gaussians with evidence, in 0..1, or 0 if none has evidence. A low value means that the views
     disagree, so more views of the same kind may not help."""
     views: float
-    """Mean number of lifted views that show a Gaussian with at least a tenth of its largest weight in an image."""
+    """Mean number of lifted views in which a Gaussian has at least a tenth of s_j."""
     unsupported: float
-    """Share of Gaussians that voting cannot repair, because neither they nor their neighbors have evidence, in 0..1."""
+    """Share of the region, weighted by s_j, that voting cannot repair because neither the Gaussians nor their neighbors
+    have R > 0."""
 
 
 class GaussianEvidence(NamedTuple):
@@ -166,16 +167,16 @@ class GaussianEvidence(NamedTuple):
     means: Float[Tensor, "n 3"]
     scalars: Scalars
     surface: Float64[Tensor, " n"]
-    """s_j, the largest weight of the Gaussian in an image."""
+    """Surface s_j, the largest weight of the Gaussian in any image, as a share of the image."""
     reliability: Float64[Tensor, " n"]
     """R_j(S), the expected reliability with the lifted views."""
     views: Int[Tensor, " n"]
-    """Number of lifted views that show the Gaussian."""
+    """Number of lifted views in which the Gaussian has at least a tenth of s_j."""
     unsupported: Bool[Tensor, " n"]
 
 
 def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """Return a mask that omits the smallest Gaussians, which together have at most `_HIDDEN_SHARE` of the surface.
+    """Return a mask that omits the Gaussians with the smallest surface, up to `_HIDDEN_SHARE` of the total surface.
 
     >>> visible(torch.tensor([0.5, 0.001, 0.5, 0.0])).tolist()
     [True, False, True, False]
@@ -189,10 +190,10 @@ def visible(surface: Float64[Tensor, " n"]) -> Bool[Tensor, " n"]:
 def weak_regions(
     evidence: GaussianEvidence, min_reliability: float
 ) -> tuple[list[WeakRegion], list[Int64[Tensor, " m"]]]:
-    """Return regions of visible Gaussians with R_j(S) below a bound, and the Gaussians of each region.
+    """Return regions of visible Gaussians with R_j(S) below `min_reliability`, and the Gaussians of each region.
 
     Regions are sorted by sum_j s_j (min_reliability - R_j(S)), descending. Regions with less than `_MIN_SHARE` of the
-    surface are left out, and so are all regions after the first `_MAX_REGIONS`.
+    total surface are left out, and so are all regions after the first `_MAX_REGIONS`.
     """
     surface = evidence.surface
     weak = visible(surface) & (evidence.reliability < min_reliability)
@@ -245,9 +246,9 @@ def _region(evidence: GaussianEvidence, rows: Int64[Tensor, " m"]) -> WeakRegion
 
 
 PIXELS = 20_000
-"""Number of pixels per image for the rasterization of weights."""
+"""Approximate number of pixels per image for rasterizing weights; smaller images keep their size."""
 FAINT = 0.1
-"""Smallest weight of a Gaussian in a view that shows it, as a share of its largest weight in any view."""
+"""Minimum weight of a Gaussian in a view that shows it, as a share of its largest weight in any view."""
 
 _CHUNK = 2**24
 """Number of entries to process at a time."""
@@ -264,7 +265,7 @@ class RasterInputs(NamedTuple):
 
 @dataclass(frozen=True)
 class ReliabilityModel:
-    """Evidence of the lifted views for every Gaussian in float64, from which reliability is computed."""
+    """Evidence of every Gaussian from the lifted views, in float64, for computing its reliability with more views."""
 
     norm: Float64[Tensor, " n"]
     """||f_j||, or its expected value for Gaussians without evidence."""
@@ -273,18 +274,18 @@ class ReliabilityModel:
     squared: Float64[Tensor, " n"]
     """sum_v W_jv ** 2 over the lifted views."""
     surface: Float64[Tensor, " n"]
-    """s_j, the largest weight of the Gaussian in an image."""
+    """s_j, the largest weight of the Gaussian in any image, as a share of the image."""
     beta: float
 
     def reliability(
         self, weight: Float64[Tensor, " m"], squared: Float64[Tensor, " m"], rows: Tensor | slice = slice(None)
     ) -> Float64[Tensor, " m"]:
-        """Return R_j of some Gaussians for the given sums of weights and of squared weights."""
+        """Return R_j of the Gaussians `rows` (default: all) for the given sums of weights and of squared weights."""
         n_eff = _ratio(weight**2, squared + (FAINT * self.surface[rows]) ** 2)
         return self.norm[rows] * reliability(1.0, n_eff, self.beta)
 
     def with_view(self, views: SparseRows, view: int) -> ReliabilityModel:
-        """Return the evidence after the lift of one more view."""
+        """Return the model with the evidence of one more view."""
         entries = views.column == view
         rows, weight = views.row_index()[entries], views.weight[entries].double()
         return replace(
@@ -313,7 +314,7 @@ def view_weights(drawn: RasterInputs, cameras: Sequence[Camera], *, pixels: int 
 
 
 def max_weights(weights: SparseRows) -> Float64[Tensor, " n"]:
-    """Return s_j, the largest weight of every Gaussian in any view, or 0 if it is not visible."""
+    """Return s_j, the largest weight of each Gaussian in any view; 0 for Gaussians that are not visible."""
     maxima = weights.weight.new_zeros(len(weights))
     return maxima.scatter_reduce_(0, weights.row_index(), weights.weight, "amax").double()
 
@@ -327,10 +328,10 @@ def count_views(weights: SparseRows, surface: Float64[Tensor, " n"]) -> Int64[Te
 def model_of_lift(
     scalars: Scalars, lifted: SparseRows, surface: Float64[Tensor, " n"], *, beta: float
 ) -> ReliabilityModel:
-    """Return the evidence of a lift.
+    """Return the reliability model of a lift.
 
-    N_eff, ||f_j|| and W_j are those of the lift. W_j is rescaled to shares of an image, because the lift used a
-    different resolution and several levels of regions.
+    N_eff, ||f_j|| and W_j are those of the lift. W_j is rescaled to shares of an image, because the lift may have used
+    a different resolution and several levels of regions.
 
     Args:
         lifted: Weights of the lifted views, [N, views].
@@ -345,7 +346,7 @@ def model_of_lift(
 
 
 def gains(model: ReliabilityModel, views: SparseRows, count: int) -> Float64[Tensor, " views"]:
-    """Return gain(v) of every view, the increase of the mean reliability if it is lifted in addition."""
+    """Return gain(v) of every view v, the increase of the mean reliability if v is added to the lift."""
     before = model.reliability(model.weight, model.squared)
     rise = torch.zeros(count, dtype=torch.float64, device=before.device)
     parts = (x.split(_CHUNK) for x in (views.row_index(), views.column, views.weight))
@@ -381,7 +382,7 @@ def choose_views(
 
 
 def visible_shares(views: SparseRows, count: int, surface: Tensor, parts: Sequence[Tensor]) -> Float64[Tensor, "p v"]:
-    """Return the share of each part that a view shows, [parts, views], as sum_j min(W_jv, s_j) / sum_j s_j.
+    """Return the share of each part that each view shows, [parts, views], as sum_j min(W_jv, s_j) / sum_j s_j.
 
     The share is 1 if every Gaussian of the part has its largest weight in the view.
     """
@@ -395,7 +396,7 @@ def visible_shares(views: SparseRows, count: int, surface: Tensor, parts: Sequen
 
 
 def _ratio(numerator: Float[Tensor, "*n"], denominator: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Divide two arrays, with 0 for a denominator of 0."""
+    """Divide two tensors, with 0 for a denominator of 0."""
     return torch.where(denominator > 0, numerator / denominator, 0.0)
 
 
@@ -407,15 +408,15 @@ def _ratio(numerator: Float[Tensor, "*n"], denominator: Float[Tensor, "*n"]) -> 
 
 
 _TARGET_REGIONS = 4
-"""Number of regions for which candidates are computed, starting with the largest lack of evidence."""
+"""Maximum number of regions for which candidate poses are computed, in the order of `weak_regions`."""
 _CAMERA_POSITIONS, _RING_POSITIONS = 12, 12
 """Number of camera positions, and of azimuths on each ring, for candidates of one region."""
 _MAX_CANDIDATES = 10
-"""Largest number of candidates per region whose weights are rasterized."""
+"""Maximum number of candidates per region whose weights are rasterized."""
 MIN_SHOWN_SHARE = 0.3
-"""Smallest value of `visible_shares` for which a view counts as showing a region."""
+"""Minimum value of `visible_shares` for which a view counts as showing a region."""
 _MIN_DEPTH = 0.15
-"""Smallest depth in front of a new camera, as a share of the median depth of the images."""
+"""Minimum depth in front of a new camera, as a share of the median depth of the images."""
 _NEAR_SHARE = 0.05
 """Share of the pixels of a new camera that may have a depth below `_MIN_DEPTH`.
 
@@ -431,11 +432,12 @@ class Pose:
 
     camera: Camera
     gain: float
-    """Expected increase of the mean reliability of all surfaces, in addition to the lift and the previous poses."""
+    """Expected increase of `Coverage.reliability` if an image from this pose is added to the lift, after images from
+    the previous poses. Only Gaussians in weak regions contribute."""
     regions: list[int]
-    """Positions in `Coverage.regions`, from 1, of the regions that the camera shows."""
+    """Numbers of the weak regions that the pose shows; region 1 is the first in `Coverage.regions`."""
     shown: float
-    """Largest value of `visible_shares` over the regions, in 0..1."""
+    """Largest value of `visible_shares` over the weak regions, in 0..1."""
 
     @property
     def field_of_view(self) -> float:
@@ -451,13 +453,13 @@ class Pose:
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Space in which a camera can be placed, derived from the images."""
+    """Space in which a camera can be placed, derived from the cameras and depths of the images."""
 
     camera_positions: Float64[Tensor, "v 3"]
     up: Float64[Tensor, " 3"]
     cameras: Sequence[Camera]
     depths: Sequence[Float64[Tensor, "h w"]]
-    """Depth of every pixel of `cameras`, infinite for empty pixels."""
+    """Depth of every pixel of each camera in `cameras`; infinite for empty pixels."""
 
     @property
     def depth(self) -> float:
@@ -483,7 +485,7 @@ class FreeSpace:
 
 
 def free_space(drawn: RasterInputs, cameras: Sequence[Camera]) -> FreeSpace:
-    """Compute the free space from the depths of some of the images."""
+    """Compute the free space from the positions of all cameras and the rendered depths of some of them."""
     chosen = [_with_pixels(cameras[i], _DEPTH_PIXELS) for i in sample_evenly(len(cameras), _DEPTH_VIEWS)]
     to_world = torch.stack([camera.world_to_camera.double().cpu().inverse() for camera in cameras])
     up = normalize(-to_world[:, :3, 1].mean(0), dim=0)
@@ -509,7 +511,7 @@ def _mean_of_pixels(
 def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64[Tensor, "p 3"]:
     """Return free positions for cameras that face a target.
 
-    They are positions of images, and positions on two rings around the target at the height of the cameras.
+    They are camera positions, and positions on two rings around the target at the median height of the cameras.
     """
     away = space.camera_positions - target
     height = away @ space.up
@@ -547,11 +549,11 @@ def suggest_poses(
     targets: Sequence[Sequence[float]],
     parts: Sequence[Tensor],
 ) -> list[Pose]:
-    """Suggest poses for the regions, chosen greedily by their gain.
+    """Suggest poses that show the given regions, chosen greedily by their gain in these regions.
 
     Args:
         targets: Centers of the regions.
-        parts: Gaussians of the regions.
+        parts: Indices of the Gaussians in each region.
     """
     if len(parts) == 0:
         return []
@@ -573,7 +575,7 @@ def suggest_poses(
 
     @cache
     def accept(view: int) -> bool:
-        """Return True if a view shows a region and most pixels of the view are far enough from the camera."""
+        """Return True if a view shows a region and the depth of most of its pixels is large enough."""
         if float(shown[:, view].max()) < MIN_SHOWN_SHARE:
             return False
         depth = mean_depth(drawn, _with_pixels(candidates[view], _DEPTH_PIXELS)).flatten()
@@ -584,7 +586,7 @@ def suggest_poses(
 
 
 def _regions_shown(shown: Float64[Tensor, "p v"], view: int) -> list[int]:
-    """Return the numbers of the regions in a view, from 1."""
+    """Return the 1-based numbers of the regions that a view shows."""
     return [i for i, share in enumerate(shown[:, view].tolist(), 1) if share >= MIN_SHOWN_SHARE]
 
 
@@ -592,20 +594,20 @@ def _regions_shown(shown: Float64[Tensor, "p v"], view: int) -> list[int]:
 
 
 _MAX_RENDER_PIXELS = 300_000
-"""Largest number of pixels of a render."""
+"""Approximate maximum number of pixels of a render."""
 _INCHES = 6.0
 
 
 class PoseRender(NamedTuple):
-    """Render of the scene and of reliability from a pose."""
+    """Renders of the scene and of its reliability from a pose."""
 
     image: UInt8[Tensor, "h w 3"]
     reliability: Float[Tensor, "h w"]
-    """Mean R in 0..1, or NaN for empty pixels."""
+    """Mean R_j(S) at every pixel, in 0..1, or NaN for empty pixels."""
 
 
 def render_pose(drawn: RasterInputs, scene: Scene, reliability: Float64[Tensor, " n"], pose: Pose) -> PoseRender:
-    """Render the trained scene from a new pose, with the mean R at every pixel."""
+    """Render the trained scene and its mean reliability at every pixel from a new pose."""
     camera = _with_pixels(pose.camera, _MAX_RENDER_PIXELS)
     image = render_image(scene, camera, settings=drawn.settings, gaussians=drawn.gaussians)
     values = reliability[:, None].to(drawn.gaussians.means)
@@ -615,7 +617,7 @@ def render_pose(drawn: RasterInputs, scene: Scene, reliability: Float64[Tensor, 
 def camera_path(poses: Sequence[Pose]) -> dict[str, Any]:
     """Return a camera path for `ns-render camera-path`, with one second per pose.
 
-    The path is valid only for the run of the poses, because it uses the coordinates of this run.
+    The path is valid only for the run for which the poses were computed, because it uses the coordinates of this run.
     """
     width, height = (poses[0].camera.width, poses[0].camera.height)
     cameras = [
@@ -638,12 +640,12 @@ def write_poses(
     documents: Mapping[Path, Mapping[str, Any]] | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write <stem>_camera_path.json and <stem>_pose_1.png …, if there are poses, and return the paths.
+    """Write the documents and, if there are poses, <stem>_camera_path.json and <stem>_pose_1.png …; return the paths.
 
     On an error, none of the files is written.
 
     Args:
-        documents: Additional JSON files for the same folder.
+        documents: Content of additional JSON files, by path.
         overwrite: Replace existing files, and remove those of an earlier study.
     Raises:
         FileExistsError: If a file exists and `overwrite` is False.
@@ -684,9 +686,9 @@ def save_pose_render(path: Path, title: str, picture: PoseRender) -> None:
 
 
 RELIABLE = 0.5
-"""Smallest R of a reliable Gaussian. With beta 1, a single consistent view gives this value."""
+"""Minimum R of a reliable Gaussian. With beta = 1, a single consistent view gives this value."""
 _MAX_IMAGES = 12
-"""Largest number of suggested images."""
+"""Maximum number of suggested images."""
 
 
 @dataclass(frozen=True)
@@ -697,9 +699,9 @@ class SuggestedImage:
     why: LeftOutReason
     """Reason why the image was not lifted."""
     gain: float
-    """Expected increase of the mean reliability of all surfaces, in addition to the lift and the previous images."""
+    """Expected increase of `Coverage.reliability` if the image is added to the lift, after the previous images."""
     regions: list[int]
-    """Positions in `Coverage.regions`, from 1, of the regions that the image shows."""
+    """Numbers of the weak regions that the image shows; region 1 is the first in `Coverage.regions`."""
 
 
 @check_arguments
@@ -716,7 +718,8 @@ class Coverage:
     """
 
     reliability: float
-    """Mean over all surfaces in the images of R_j(S), the expected reliability with the lifted views, in 0..1."""
+    """Mean of R_j(S), the expected reliability with the lifted views, in 0..1, weighted by s_j, the largest weight of
+    Gaussian j in any image."""
     regions: list[WeakRegion]
     """Regions without reliable evidence, worst first."""
     photographs: list[SuggestedImage]
@@ -743,7 +746,7 @@ class Coverage:
         `ns-render camera-path` renders the camera path with the run.
 
         Args:
-            overwrite: Replace existing files.
+            overwrite: Replace existing files, and remove those of an earlier study.
         Raises:
             FileExistsError: If a file exists and `overwrite` is False.
             ValueError: If the path is not a file name, or a file of the run would be replaced.
@@ -766,11 +769,11 @@ class Coverage:
 def coverage(run: LiftedRun, *, min_reliability: float = RELIABLE, device: str | None = None) -> Coverage:
     """Find regions without reliable evidence, unused images that would help most, and new poses for these regions.
 
-    The study does not lift or read images. It rasterizes weights of views at a low resolution, and computes from them
-    the reliability with one more view, by the formula in `evaluation.coverage`.
+    The study does not read or lift images. It rasterizes the weights of the views at a low resolution. From these, it
+    computes the reliability with one more view by the formula in `evaluation.coverage`.
 
     Args:
-        min_reliability: Smallest R of a reliable Gaussian, in 0..1.
+        min_reliability: Minimum R of a reliable Gaussian, in 0..1.
         device: Device for the rasterization (default: that of the run).
     Raises:
         ValueError: If `min_reliability` is not in 0..1 or no image shows a Gaussian, or as in `lifted_names`.

@@ -87,7 +87,7 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
     """Read a label file, and fill its polygons after scaling them to the size of the image.
 
     Raises:
-        ValueError: If the file has the wrong format, labels an image whose aspect ratio differs by more than 1 %, or
+        ValueError: If the file has the wrong format, labels an image whose aspect ratio differs by more than 1%, or
             has a polygon outside the image. The message names the file.
     """
     try:
@@ -124,7 +124,7 @@ def read_frame(file: Path, width: int, height: int) -> LabeledFrame:
 
 
 def _points(segmentation: Sequence[_Point], width: int, height: int) -> np.ndarray:
-    """Return the points of a polygon. Raise InputError if a point is farther from the image than the image size."""
+    """Return the points of a polygon; raise InputError if one is more than an image width or height out of bounds."""
     points = np.array(segmentation, dtype=float)
     distance = np.abs(points / (width, height) - 0.5)
     if distance.max() > 1.5:
@@ -143,9 +143,9 @@ def match_views(files: Sequence[Path], names: Sequence[str]) -> tuple[dict[Path,
     """Match label files with images by their stems.
 
     Returns:
-        The image of every label file with an image, and the stems of the other label files.
+        The image of every label file that matches one, and the stems of the other label files.
     Raises:
-        ValueError: If no label file has an image, or a label file has several images.
+        ValueError: If no label file matches an image, or a label file matches several images.
     """
     images: dict[str, list[str]] = {}
     for name in names:
@@ -181,10 +181,10 @@ class FrameScores(NamedTuple):
 
     frame: LabeledFrame
     prompts: Float[Tensor, "h w q"]
-    """Scores of the frame's categories, in the order of `frame.masks`."""
+    """Scores of the categories, in the order of `frame.masks`. With LangSplat's maskings, they are relevancies."""
     background: Float[Tensor, "h w b"]
-    """Scores of `BACKGROUND_WORDS` for masking "background". With LangSplat's maskings, they are not used, because
-    `prompts` are relevancies."""
+    """Scores of `BACKGROUND_WORDS`, or of `CANONICAL_NEGATIVES` with LangSplat's maskings. Only the masking
+    "background" uses them."""
 
 
 def prompt_mask(
@@ -200,10 +200,10 @@ def prompt_mask(
     Args:
         masking: "background" selects scores that exceed those of all background words by more than the margin.
             "auto" selects scores of at least `histogram_threshold`. "langsplat" and "langsplat_composited" scale the
-            relevancy to 0..1 over the image. They select a pixel if most pixels around it exceed 0.7, which LangSplat
-            writes as 2 x - 1 > 0.4.
+            relevancy to 0..1 over the image. They select a pixel if most of the pixels around it exceed 0.7, which
+            LangSplat writes as 2 x - 1 > 0.4.
         margin: Lead over the background words, in cosine.
-        instances: Number of true instances.
+        instances: True number of instances of the prompt in the frame.
     """
     if masking == "background":
         return score > background.max(dim=2).values + margin
@@ -244,8 +244,8 @@ def box_filtered(relevancy: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"],
 def frame_rows(scores: FrameScores, masking: Masking, *, margin: float, clean: bool) -> list[dict[str, Any]]:
     """Compute IoU, recall and localization of each category.
 
-    A category is localized if its peak is in the mask. With LangSplat's maskings, a category can have several peaks,
-    and it is localized if one of them is in one of its boxes.
+    A category is localized if its peak is in its true mask. With LangSplat's maskings, a category can have several
+    peaks, and it is localized if one of them is in one of its boxes.
     """
     rows = []
     frame, langsplat = scores.frame, masking in LANGSPLAT_MASKINGS
@@ -286,9 +286,9 @@ def summarize_lerf(rows: Sequence[dict[str, Any]], average: AveragingOrder, sett
 
     Args:
         rows: Results of `frame_rows`, each with its scene.
-        average: "frames" averages over the categories of a frame, then over frames (code of Splat Feature Solver).
+        average: "frames" averages over the categories of a frame, then over the frames (code of Splat Feature Solver).
             "pairs" averages over all pairs of frame and category (code of LangSplat). "categories" averages over the
-            frames of a category, then over categories.
+            frames of a category, then over the categories.
     """
     by_scene = _grouped(rows, lambda row: row["scene"])
     scenes: list[dict[str, Any]] = [
@@ -360,7 +360,7 @@ def _scale(lifted: EvaluatedRun, options: LerfOptions) -> Float[Tensor, "n 1"] |
 def _frame_scores(
     lifted: EvaluatedRun, camera: Camera, frame: LabeledFrame, length: Float[Tensor, "h w"] | None, options: LerfOptions
 ) -> FrameScores:
-    """Return composited scores, divided by the feature length of each pixel if `length` is given."""
+    """Return composited scores of a frame, divided by the feature length of each pixel if `length` is given."""
     prompts, langsplat = tuple(frame.masks), options.masking in LANGSPLAT_MASKINGS
     negatives = CANONICAL_NEGATIVES if langsplat else BACKGROUND_WORDS
     values, _ = lifted.composite(camera, _scale(lifted, options) * lifted.cosine((*prompts, *negatives)))

@@ -27,7 +27,7 @@ Feature Solver uses 0."""
 
 
 MAX_SUGGESTED_POSES = 5
-"""Largest number of new poses that the coverage study suggests."""
+"""Maximum number of new poses that the coverage study suggests."""
 
 
 def pose_output_paths(stem: Path) -> tuple[Path, ...]:
@@ -130,7 +130,7 @@ class Evaluation:
     """Metrics of one protocol for one or several runs."""
 
     results: Mapping[str, float]
-    """Metrics by name, as in the `results` of a file of ns-eval. Shares are in 0..1."""
+    """Metrics by name, as in the `results` of an ns-eval file. Shares are in 0..1."""
     rows: Sequence[Mapping[str, Any]]
     """Metrics per class and per scene or frame, as JSON types."""
     settings: Mapping[str, Any]

@@ -47,11 +47,11 @@ class Names:
     classes: tuple[str, ...]
     """Distinct names, which are used as prompts."""
     class_of: Mapping[int, int]
-    """Class of each value. Pixels with other values are ignored."""
+    """Index in `classes` of each mask value. Pixels with other values are ignored."""
 
 
 def read_names(path: Path) -> Names:
-    """Read a JSON file such as {"labels": {"1": "table", ...}, "background": 0}, or only the inner part.
+    """Read a JSON file such as {"labels": {"1": "table", ...}, "background": 0}, or only the object under "labels".
 
     Values with the same name belong to the same class.
 
@@ -108,8 +108,8 @@ def gaussian_truth(
     A Gaussian below either minimum has class -1.
 
     Args:
-        purity: Smallest share of the class in the weight of the Gaussian. The weight includes that of ignored pixels.
-        min_weight: Smallest weight over all views, in pixels.
+        purity: Minimum share of the class in the weight of the Gaussian. The weight includes that of ignored pixels.
+        min_weight: Minimum weight over all views, in pixels.
     """
     columns = torch.arange(evidence.num_regions) % classes
     by_class = evidence.rows.matmul(torch.nn.functional.one_hot(columns, classes).to(evidence.rows.weight))
@@ -161,7 +161,7 @@ _CHANNELS = 64
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """A lifted run with the settings of its evaluation."""
+    """Lifted run with the settings of its evaluation."""
 
     scene: Scene
     field: SemanticField
@@ -171,7 +171,7 @@ class EvaluatedRun:
     """Folder of the lift's cache of 2D features, or None without a cache."""
 
     def cosine(self, names: Sequence[str]) -> Float[Tensor, "n q"]:
-        """Return the cosine between every Gaussian's direction and each prompt, or 0 without a direction."""
+        """Return the cosine between every Gaussian's direction and each prompt; 0 for Gaussians without a direction."""
         return self.field.query(self.texts.text(names), refined=self.refined).float()
 
     @property
@@ -195,7 +195,7 @@ class EvaluatedRun:
         """Return the length of the composited feature vector of every pixel, for each camera.
 
         Args:
-            factor: Number that multiplies each direction before compositing.
+            factor: Factor for all directions, or one per direction, to apply before compositing.
         """
         squares = [torch.zeros(camera.height, camera.width, dtype=torch.float64) for camera in cameras]
         for axes in torch.eye(self.field.dimension).split(_CHANNELS):
@@ -217,14 +217,14 @@ Rasterize = Callable[..., Evidence]
 def rasterizer(scene: Scene, settings: RasterSettings | None, gaussians: GaussianScene | None = None) -> Rasterize:
     """Return `rasterize_evidence` with the Gaussians and the mode of a scene as fixed arguments.
 
-    `gaussians` replaces the Gaussians of the scene, for example by a copy on another device.
+    `gaussians` replaces the Gaussians of the scene, for example with a copy on another device.
     """
     gaussians = scene.gaussians if gaussians is None else gaussians
     return partial(rasterize_evidence, gaussians, rasterize_mode=scene.rasterize_mode, settings=settings)
 
 
 def scene_names(labels: Sequence[Path]) -> list[str]:
-    """Return a scene name for each label file or folder: its name before "_vh_clean", or its path if not unique.
+    """Return a scene name for each label file or folder: its name up to "_vh_clean", or its path for repeated names.
 
     >>> scene_names([Path("label/ramen"), Path("a/scene0000_00_vh_clean_2.labels.ply")])
     ['ramen', 'scene0000_00']
@@ -241,9 +241,9 @@ class MaskTruth:
 
     classes: tuple[str, ...]
     gaussians: Int64[Tensor, " n"]
-    """Class of every Gaussian, or -1 for Gaussians to ignore."""
+    """Index in `classes` for every Gaussian, or -1 for Gaussians to ignore."""
     held_out: Sequence[Int64[Tensor, "h w"]]
-    """Class of every pixel in each held-out view, or -1 for pixels to ignore."""
+    """Index in `classes` for every pixel of each held-out view, or -1 for pixels to ignore."""
     settings: Mapping[str, Any]
 
 

@@ -27,7 +27,7 @@ class PublishedTable:
 
 
 def _numbers(metrics: Sequence[str], rows: Mapping[str, Sequence[float]]) -> Numbers:
-    """Return the numbers of rows with one value for each metric."""
+    """Return the numbers of a table from its rows, which have one value per metric."""
     return {(row, metric): value for row, values in rows.items() for metric, value in zip(metrics, values)}
 
 
@@ -145,15 +145,15 @@ TABLES: Mapping[str, PublishedTable] = {
 def compare_with_paper(
     evaluation: Evaluation, studies: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return the paper's tables that the evaluation can be compared with, and its results in the column `yours`.
+    """Return the paper's tables for an evaluation and its studies, with their results in the column `yours`.
 
     Args:
-        evaluation: Result of --protocol scannet or lerf. Studies belong to the data set of the paper: ablation and
-            signals to scannet, timing to lerf.
+        evaluation: Result of --protocol scannet or lerf. As in the paper, the studies ablation and signals are compared
+            only for scannet, and timing only for lerf.
         studies: Rows of each study, by its name.
     Returns:
-        Rows by title of the table. `yours` is NaN if the evaluation lacks the scene or the variant, and `difference` is
-        `yours` minus the number of NormLift.
+        Rows of each table, by table title. `yours` is NaN if the evaluation lacks the number. `difference` is `yours`
+        minus the paper's number for NormLift.
 
     >>> rows = compare_with_paper(Evaluation({"miou_19": 0.3}, [], {"protocol": "scannet"}), {})
     >>> [round(row["difference"], 2) for row in rows["Table 1 of the paper, ScanNet, in percent"][:1]]
@@ -174,7 +174,7 @@ def compare_with_paper(
 
 
 def with_own_column(table: PublishedTable, own: Numbers) -> list[dict[str, Any]]:
-    """Return the rows of a table with the columns `yours` and `difference`; both are NaN for missing numbers."""
+    """Return the rows of a table with the columns `yours` and `difference`; both are NaN if `own` lacks the number."""
     rows = []
     for row, metric in table.columns["NormLift"]:
         yours = table.factor * own.get((row, metric), math.nan)
@@ -194,14 +194,14 @@ def _of_rows(key: str, rows: Sequence[Mapping[str, Any]]) -> Numbers:
 
 
 def _of_signals(rows: Sequence[Mapping[str, Any]]) -> Numbers:
-    """Return the signals of all scenes together. For a single scene, these are its own."""
+    """Return the signals of the last row, which is for all scenes together or for a single scene."""
     return {("all scenes", metric): value for row in rows[-1:] for metric, value in row.items() if metric != "scene"}
 
 
 def _of_timing(rows: Sequence[Mapping[str, Any]]) -> Numbers:
-    """Return the seconds of two groups of stages per scene.
+    """Return the seconds of each scene in two groups of stages.
 
-    `lift_s` is the sum for evidence, consensus and lift, and `post_lift_s` that for neighbors and vote.
+    `lift_s` is the sum for evidence, consensus and lift. `post_lift_s` is the sum for neighbors and vote.
     """
     parts = {"lift_s": ("evidence_s", "consensus_s", "lift_s"), "post_lift_s": ("neighbors_s", "vote_s")}
     return {

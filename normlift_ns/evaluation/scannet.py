@@ -47,7 +47,7 @@ class SceneLabels(NamedTuple):
 
     name: str
     cosine: Float[Tensor, "n 19"]
-    """Cosine between every Gaussian and the names in `NYU40`, in this order."""
+    """Cosine between every Gaussian's direction and each class name, in the order of `NYU40`."""
     valid: Bool[Tensor, " n"]
     """Mask of the Gaussians with a direction."""
     opacity: Float[Tensor, " n"]
@@ -97,7 +97,7 @@ def read_labels(path: Path) -> Int64[Tensor, " n"]:
 
 
 def check_identity(name: str, gaussians: int, labels: Int64[Tensor, " n"], path: Path) -> None:
-    """Raise ValueError unless the number of Gaussians equals that of vertices, because Gaussian i must be vertex i."""
+    """Raise ValueError if the numbers of Gaussians and vertices differ, because Gaussian i must be vertex i."""
     if len(labels) != gaussians:
         raise InputError(
             f"run {name} has {gaussians:,} Gaussians, but {path} has {len(labels):,} vertices. The protocol needs one "
@@ -124,7 +124,7 @@ def scene_scores(
 def predict_classes(
     scene: SceneLabels, classes: int, *, min_opacity: float, without_direction: WithoutDirection
 ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"]]:
-    """Return the true and the predicted class of every Gaussian as indices of the class set, as in `scene_scores`."""
+    """Return the true and the predicted class of every Gaussian as indices in the class set, as in `scene_scores`."""
     ids = list(NYU40)
     columns = [ids.index(i) for i in CLASS_SETS[classes]]
     class_of = torch.full((max(int(scene.nyu40.max()), *ids) + 1,), NO_CLASS)
@@ -171,7 +171,7 @@ def evaluate_scannet(scenes: Sequence[SceneLabels], options: ScannetOptions) -> 
 
 
 def _class_rows(scene: str, classes: int, scores: ClassScores) -> list[dict[str, Any]]:
-    """Return the scores of each class in a scene."""
+    """Return the scores of each class in the ground truth of a scene."""
     return [
         {"scene": scene, "classes": classes, "class": NYU40[i], "iou": iou, "accuracy": accuracy}
         for i, iou, accuracy in zip(CLASS_SETS[classes], scores.iou.tolist(), scores.accuracy.tolist())
@@ -185,7 +185,7 @@ def label_scene(
     """Return the inputs of protocol scannet for a run.
 
     Raises:
-        ValueError: If the number of vertices differs from that of Gaussians.
+        ValueError: If the number of vertices differs from the number of Gaussians.
     """
     check_identity(name, len(lifted.scene.gaussians), nyu40, path)
     prompts = NYU40 if options.spelling == "script" else NYU40 | PAPER_SPELLING

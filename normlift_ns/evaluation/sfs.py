@@ -14,7 +14,7 @@ _MIN_RANGE, _MIN_VARIANCE = 1e-12, 1e-10
 _MAX_QUANTILE_VALUES = 2**24
 """Largest number of values that torch.quantile accepts."""
 _EPSILON = 1e-12
-"""Lower bound on the share of pixels on a side of Otsu's split, so that the mean of an empty side is finite."""
+"""Number added to the share of pixels on a side of Otsu's split, so that the mean of an empty side is finite."""
 
 
 def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
@@ -25,8 +25,8 @@ def histogram_threshold(score: Float[Tensor, "h w"], instances: int) -> float:
     instances, or the rightmost peak if there are fewer.
 
     The valley is the nearest bin to the left that is lower than the peak and has no lower neighbor. The first bin
-    is excluded. Without such a bin, the valley is the rightmost lower bin on the right of the peak. The threshold
-    is the center of the valley.
+    is excluded. Without such a bin, the valley is the rightmost bin to the right of the peak that is lower than the
+    peak. The threshold is the center of the valley.
 
     Without a peak or a valley, the threshold is the mean of Otsu's threshold on the 40 bins and the 75th percentile. If
     all scores are nearly equal (variance below 1e-10), it is their mean.
@@ -71,8 +71,8 @@ def _valley(counts: list[int], instances: int) -> int | None:
 
 
 def _otsu(counts: Int64[Tensor, " bins"], edges: Float[Tensor, " edges"]) -> float:
-    """Return Otsu's threshold: the float32 center of the last bin below the split with the largest variance between
-    sides."""
+    """Return Otsu's threshold: the center, in float32, of the last bin below the split with the largest between-class
+    variance."""
     center, share = (edges[:-1] + edges[1:]) / 2, counts.float() / int(counts.sum())
     below, moment = share.cumsum(0), (share * center).cumsum(0)
     above, total = 1 - below, (share * center).sum()
@@ -81,10 +81,10 @@ def _otsu(counts: Int64[Tensor, " bins"], edges: Float[Tensor, " edges"]) -> flo
 
 
 def clean_mask(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Open and close a mask by 3 x 3 pixels, keep the largest 8-connected component, and fill its holes.
+    """Open and close a mask with a 3 x 3 square, keep the largest 8-connected component, and fill its holes.
 
-    The first of several equal components is kept. Pixels outside the image are empty in every step, so the outermost
-    rows and columns of the result are empty.
+    The first of several equally large components is kept. Pixels outside the image are empty in every step, so the
+    outermost rows and columns of the result are empty.
     """
     image, square = mask.cpu().numpy().astype(np.uint8), np.ones((3, 3), np.uint8)
     for step in (cv2.erode, cv2.dilate, cv2.dilate, cv2.erode):

@@ -237,9 +237,9 @@ def _changed(own: Vote, parameter: str, value: float, label: Mapping[str, Any]) 
 
 
 def make_voter(field: SemanticField, means: Float[Tensor, "n 3"], device: str) -> Callable[[Vote], SemanticField]:
-    """Return a function that repeats the vote of a field with other options, on the device.
+    """Return a function that repeats the vote of a field with other options, on `device`.
 
-    The function searches neighbors once per K. Only linear averaging keeps all directions in memory.
+    The function searches for neighbors once per K. Only linear averaging keeps all directions in memory.
     """
     device_field, means = field.to(device), means.to(device)
     scalars = voting_scalars(device_field)
@@ -299,17 +299,17 @@ def signal_statistics(*scenes: SceneSignals) -> dict[str, float]:
 
     The groups are `all`, `zero` (R = 0) and `seen` (R > 0), as in the paper's table of zero-evidence Gaussians. Each
     has its `.share` of all Gaussians, the mean `.opacity`, the share of `.faint` Gaussians and the mean number of
-    `.views`. With ground truth, it also has `.accuracy_unrefined` and, after a vote, `.accuracy_refined`.
+    `.views`. With ground truth, each also has `.accuracy_unrefined` and, after a vote, `.accuracy_refined`.
 
     Opacity is compared with R for Gaussians with R > 0. `opacity.spearman` and `opacity.kendall` are correlations, with
     p-values `…_p`. `opacity.jaccard` is the Jaccard index of the fifth with the lowest R and the fifth with the lowest
-    opacity. `opacity.quintile1` … are mean opacities by ascending R.
+    opacity. `opacity.quintile1` … are mean opacities in fifths of ascending R.
 
     With ground truth, `reliability.bin1` … are the accuracies of unrefined predictions in ten bins of equal count by R.
-    `norm.bin1` … are those by ||f||. `….spearman_bins` is their rank correlation with the bin number. `histogram.0.00`
-    … are shares by R.
+    `norm.bin1` … are those by ||f||. `….spearman_bins` is their rank correlation with the bin number.
 
-    The p-values assume that Gaussians are independent, but neighbors are not independent.
+    `histogram.0.00` … are shares of all Gaussians in bins of R, in which Gaussians with R = 0 are not counted. The
+    p-values assume that Gaussians are independent, but neighbors are not independent.
     """
     reliability, norm, views = (
         torch.cat([getattr(scene.scalars, name) for scene in scenes]) for name in ("reliability", "norm", "view_count")
@@ -356,7 +356,7 @@ def _correct_predictions(scenes: Sequence[SceneSignals]) -> tuple[Bool[Tensor, "
 
 
 def accuracy_bins(key: Float[Tensor, " n"], correct: Bool[Tensor, " n"], bins: int = 10) -> list[float]:
-    """Return the share of correct predictions in bins of equal count by the key. Keys <= 0 are ignored."""
+    """Return the share of correct predictions in bins of equal count by the key, for Gaussians with a key > 0."""
     positive = key > 0
     return list(_bins(key[positive], correct[positive].double(), bins))
 
@@ -448,7 +448,7 @@ def signals_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def make_figure(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, list[Any]]:
-    """Return a figure with a size in inches, and its panels row by row."""
+    """Return a figure with the given size in inches, and its panels row by row."""
     from matplotlib.figure import Figure  # noqa: PLC0415 (only drawing needs it)
 
     figure = Figure(figsize=size, layout="constrained")
@@ -485,7 +485,7 @@ def study_ablation(
     """Evaluate the protocol with every variant without consensus, and with `CONSENSUS_VARIANTS` after a consensus.
 
     Args:
-        warn: Function that receives the reason if variants are skipped because features of a run are not available.
+        warn: Function that receives a warning if variants are skipped because features of a run are not available.
     """
     rows: list[Row] = []
     for on, names in ((False, {name: name for name in get_args(Variant)}), (True, CONSENSUS_VARIANTS)):
@@ -564,7 +564,7 @@ def study_timing(
     On a GPU, also time the method of Splat Feature Solver and that of this package on some views of each run.
 
     Args:
-        tell: Function that receives the reason if the method of Splat Feature Solver is skipped.
+        tell: Function that receives a message with the reason if the method of Splat Feature Solver is skipped.
     """
     rows = []
     for lifted in runs:

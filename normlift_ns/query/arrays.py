@@ -1,4 +1,4 @@
-"""Fast, query-only access to a lifted run, without torch and nerfstudio. A run opens in about a second.
+"""Query-only access to a lifted run, without torch or nerfstudio. Opening a run takes about a second.
 
 Cosines equal those of `SemanticField.query` up to rounding of float32 sums (1e-6).
 """
@@ -27,9 +27,9 @@ from normlift_ns.query.question import make_query
 from normlift_ns.query.text_encoder import text_encoder_for, with_text_source
 
 _DIRECTION_BLOCK = 8 * PROMPT_BLOCK
-"""Number of prompts that share one conversion of the float16 directions, which takes most of the time of a query."""
+"""Number of prompts per conversion of the directions to float32. The conversion takes most of the time of a query."""
 _BLOCK_ELEMENTS = 2**21
-"""Number of elements to convert to float32 at a time, so that they fit into a processor's cache."""
+"""Number of elements to convert to float32 at a time, so that they fit into the cache of a CPU."""
 
 
 class ArrayField(FieldArrays):
@@ -53,7 +53,7 @@ class ArrayField(FieldArrays):
         return (level[self.arrays["source"]] if refined else level)[:, None]
 
     def query(self, text_vectors: Float[np.ndarray, "q d"], *, refined: bool = True) -> Float32[np.ndarray, "n q"]:
-        """Return the cosine of every Gaussian's direction to Q vectors, as `SemanticField.query` does.
+        """Return the cosine between every Gaussian's direction and each of Q vectors, as `SemanticField.query` does.
 
         Raises:
             ValueError: The vectors have a different dimension than the field.
@@ -86,7 +86,7 @@ class ArrayField(FieldArrays):
         return cosine.T
 
     def _evidence_products(self, vectors: Float[np.ndarray, "q d"]) -> Callable[[slice], Float32[np.ndarray, "b m"]]:
-        """Return a function that computes the cosines of all directions to a slice of the vectors."""
+        """Return a function that computes the cosines between all directions and a slice of the vectors."""
         from scipy.sparse import csr_array  # noqa: PLC0415 (takes 0.3 s; most fields store directions)
 
         arrays, rows = self.arrays, cast(Any, self.evidence).rows
@@ -115,14 +115,14 @@ class ArrayField(FieldArrays):
 
 @dataclass(frozen=True, eq=False)
 class QuickRun:
-    """Semantic field of a run as NumPy arrays, and its text encoder."""
+    """Semantic field of a run as NumPy arrays, with the text encoder of the run."""
 
     run_dir: Path
     """Run directory."""
     field: ArrayField
     """Semantic field, whose arrays include `means`, the centers of the Gaussians."""
     manifest: Mapping[str, Any]
-    """Manifest of the field, changed by the arguments `text_embeddings` and `prompt_template` of `open_quick`."""
+    """Manifest of the field, after applying the arguments `text_embeddings` and `prompt_template` of `open_quick`."""
     device: str = "cpu"
     """Device for the network of the text encoder."""
 
@@ -166,7 +166,7 @@ def open_quick(
     text_embeddings: Path | None = None,
     prompt_template: str | None = None,
 ) -> QuickRun | None:
-    """Open the field of a lifted run; return None if its files do not determine the centers of the Gaussians.
+    """Open the field of a lifted run; return None if the run's files do not determine the centers of the Gaussians.
 
     Runs of version 0.1 do not store the centers, and other runs may have checkpoints that are newer than the lift. In
     both cases, `means` is needed.

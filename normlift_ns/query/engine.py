@@ -1,6 +1,6 @@
-"""Queries of a semantic field: relevancy and selection of every Gaussian for each prompt, with summary numbers.
+"""Queries of a semantic field: relevancy and selection of every Gaussian for each prompt, with summary statistics.
 
-The same code works for fields of torch tensors on any device (`SemanticField`), and for fields of NumPy arrays on the
+The same code works for fields of torch tensors on any device (`SemanticField`) and for fields of NumPy arrays on the
 command line (`query.arrays.ArrayField`). This module does not need torch.
 """
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _CENTRAL = (0.05, 0.95)
 """Quantiles of the selected centers that bound their extent."""
 _SUMMARIZED = ("reliability", "weight")
-"""Scalars per Gaussian from which the summary of a prompt is computed."""
+"""Names of the scalars per Gaussian that the summary of a prompt needs."""
 _THREADS = min(8, os.cpu_count() or 1)
 """Maximum number of prompts that are summarized concurrently."""
 
@@ -65,7 +65,7 @@ class QueryField(HasManifest, Protocol):
         ...
 
     def null_levels(self, *, refined: bool = True) -> Any:
-        """Return the null level of every Gaussian as one column, or an array without columns if there are none."""
+        """Return the null level of every Gaussian as one column, or an array without columns if there are no levels."""
         ...
 
 
@@ -99,7 +99,7 @@ class Answer:
     """True for Gaussians that are valid, above the threshold and reliable enough. If the query is gated, False for
     prompts that are probably not in the scene."""
     verdicts: tuple[Verdict | None, ...]
-    """Verdict on each prompt, independent of its selection."""
+    """Verdict on the presence of each prompt, regardless of the Gaussians that it selects."""
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -170,7 +170,7 @@ class Answer:
         return rows
 
     def _as_numpy(self) -> Answer:
-        """Return the answer with its arrays on the CPU. Each array is copied once for all prompts."""
+        """Return the answer with NumPy arrays, so that each array is copied to the CPU only once for all prompts."""
         arrays = {name: as_numpy(getattr(self, name)) for name in ("means", "relevancy", "valid", "selected")}
         scalars = SimpleNamespace(**{name: as_numpy(getattr(self.field.scalars, name)) for name in _SUMMARIZED})
         field: Any = SimpleNamespace(manifest=self.field.manifest, scalars=scalars)
@@ -233,12 +233,12 @@ class Finding:
 
     @property
     def centroid(self) -> list[float] | None:
-        """Weighted mean of the selected centers, [x, y, z]."""
+        """Weighted mean of the centers of the selected Gaussians, [x, y, z]."""
         return self._selection.centroid
 
     @property
     def extent(self) -> list[float] | None:
-        """Size of the box that contains the central 90 % of the selected centers along each axis."""
+        """Distance from the 5th to the 95th percentile of the selected centers along x, y and z."""
         return self._selection.extent
 
     @property
@@ -261,7 +261,7 @@ class Finding:
 
     @cached_property
     def verdict(self) -> Verdict | None:
-        """Presence of the prompt in the scene; None as in `query.threshold.judge`, or if no Gaussian has a direction.
+        """Verdict on the presence of the prompt; None if `judge` returns None or no Gaussian has a direction.
 
         For a prompt that selects Gaussians, "weak match" replaces "probably not here".
         """
@@ -270,7 +270,10 @@ class Finding:
 
     @property
     def read_as(self) -> str | None:
-        """Words of the prompt that the encoder uses; None if it ignores at most articles, or all words."""
+        """Words of the prompt that the encoder uses.
+
+        It is None if the encoder is unknown, ignores all words, or ignores no words except articles.
+        """
         kind = find_encoder_kind(encoder_name(self.answer.field))
         known = "" if kind is None else kind.known_words(self.text)
         ignored = set(re.findall(r"\w+", self.text.lower())) - set(re.findall(r"\w+", known.lower()))
@@ -278,9 +281,9 @@ class Finding:
 
     @property
     def nearest(self) -> list[float] | None:
-        """Position that is most similar to the prompt, even if no Gaussian is selected there.
+        """Weighted mean center of the Gaussians with the highest relevancy, whether or not they are selected.
 
-        It is the weighted mean center of the 0.1 % of the Gaussians that have the highest relevancy. It is None if no
+        They are the top 0.1% of the Gaussians with a direction, or at least one Gaussian. The position is None if no
         Gaussian has a direction.
         """
         if self.histogram is None:
@@ -296,13 +299,13 @@ class Finding:
 
     @property
     def objects(self) -> list[SceneObject]:
-        """Objects of the selection, by descending size: its connected components of at least 20 Gaussians."""
+        """Objects of the selection, by descending size: its connected components with at least 20 Gaussians."""
         from normlift_ns.analysis.objects import find_objects  # noqa: PLC0415 (needs torch)
 
         return find_objects(self.answer.field, self.answer.means, self.mask).objects
 
     def to_json(self) -> dict[str, Any]:
-        """Return the prompt, its verdict, its numbers and its histogram as plain Python types."""
+        """Return the prompt with its verdict, summary statistics and histogram, as plain Python types."""
         names = ("text", "fraction", "centroid", "extent", "peak", "mean_reliability", "verdict", "nearest", "read_as")
         values = {name: getattr(self, name) for name in (*names, "suggested_threshold")}
         return {**values, "histogram": None if self.histogram is None else self.histogram.to_json()}
@@ -314,24 +317,24 @@ class Finding:
 
 
 class SelectionStats(NamedTuple):
-    """Summary numbers of selected Gaussians.
+    """Summary statistics of the selected Gaussians.
 
     Positions are in the units of the centers. Means are weighted by W_j, the total weight of Gaussian j over all views.
-    All numbers except the fraction are None if no Gaussian is selected.
+    All values except the fraction are None if no Gaussian is selected.
     """
 
     fraction: float
     """Selected fraction of all Gaussians, in 0..1."""
     centroid: list[float] | None
-    """Weighted mean of the selected centers, [x, y, z]."""
+    """Weighted mean of the centers of the selected Gaussians, [x, y, z]."""
     extent: list[float] | None
-    """Size of the box that contains the central 90 % of the selected centers along each axis."""
+    """Distance from the 5th to the 95th percentile of the selected centers along x, y and z."""
     mean_reliability: float | None
     """Weighted mean of the reliability R over the selected Gaussians."""
 
     @staticmethod
     def of(mask: Any, means: Any, reliability: Any, weight: Any) -> SelectionStats:
-        """Summarize the Gaussians in `mask`; the arguments are arrays or tensors of all Gaussians."""
+        """Summarize the Gaussians in `mask`. All arguments are arrays or tensors with one row per Gaussian."""
         index = _indices(mask)
         centers, reliability, weight = (_float64(x[index]) for x in (means, reliability, weight))
         fraction = len(centers) / len(mask)
@@ -343,7 +346,7 @@ class SelectionStats(NamedTuple):
 
 
 def _indices(mask: Any) -> Any:
-    """Return the indices of a mask. Several arrays are read faster by indices than by the mask."""
+    """Return the indices of the True values of a mask. They index several arrays faster than the mask does."""
     return np.flatnonzero(mask) if isinstance(mask, np.ndarray) else mask.nonzero().squeeze(1)
 
 
@@ -360,7 +363,7 @@ def _centroid(centers: Float[np.ndarray, "m 3"], weight: Float[np.ndarray, " m"]
 
 
 def run_query(field: QueryField, means: Any, question: Query) -> Answer:
-    """Compute relevancy and selection of every Gaussian for each prompt.
+    """Compute the relevancy and selection of every Gaussian for each prompt.
 
     If `question.suggest_threshold` is set, the query in the answer has the suggested threshold.
 
@@ -390,7 +393,7 @@ def run_query(field: QueryField, means: Any, question: Query) -> Answer:
 def _judge_all(
     field: HasManifest, rule: RelevancyRule, cosine: Any, relevancy: Any, valid: Any
 ) -> list[Verdict | None]:
-    """Return the verdict on every prompt, from cosines and relevancies [N, Q], of which only the valid rows count."""
+    """Return the verdict on every prompt, from the rows of valid Gaussians in the cosines and relevancies [N, Q]."""
     if not bool(valid.any()):
         return [None] * cosine.shape[1]
     name, manifest = encoder_name(field), field.manifest

@@ -47,10 +47,10 @@ def split_prompts(text: str) -> list[str]:
 
 
 def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
-    """Split every text of an option with `split_prompts`.
+    """Split the texts of an option into prompts with `split_prompts`; drop duplicates.
 
     Raises:
-        ValueError: There are texts, but no prompts in them.
+        ValueError: There are texts, but they contain no prompt.
     """
     prompts = tuple(dict.fromkeys(prompt for text in texts for prompt in split_prompts(text)))
     if len(texts) > 0 and len(prompts) == 0:
@@ -59,7 +59,7 @@ def split_texts(name: str, texts: Sequence[str]) -> tuple[str, ...]:
 
 
 def join_prompts(texts: Sequence[str]) -> str:
-    """Join texts into a line that `split_prompts` splits into the same texts, apart from quotes and repeated blanks.
+    """Join texts into a line from which `split_prompts` recovers them, apart from quotes, extra blanks and duplicates.
 
     >>> join_prompts(["red mug", "salt, pepper"])
     'red mug, "salt, pepper"'
@@ -69,7 +69,7 @@ def join_prompts(texts: Sequence[str]) -> str:
 
 
 def as_numpy(array: Any) -> np.ndarray:
-    """Return a NumPy array, or a tensor on any device, as a NumPy array."""
+    """Convert a tensor on any device to a NumPy array; return a NumPy array unchanged."""
     return array if isinstance(array, np.ndarray) else array.detach().cpu().numpy()
 
 
@@ -89,7 +89,7 @@ class Query:
     min_reliability: float = 0.0
     """Minimum reliability R of a selected Gaussian, in 0..1."""
     refined: bool = True
-    """Use refined features."""
+    """Use refined directions."""
     encoder: str | None = None
     """Digest of the encoder that computed the embeddings, from `encoder_digest`; None if unknown."""
     suggest_threshold: bool = False
@@ -104,7 +104,7 @@ class Query:
                 object.__setattr__(self, name, as_numpy(value))
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings that select Gaussians, with their names in JSON files."""
+        """Return the settings that select Gaussians, under their names in JSON files."""
         return {"relevancy": self.rule, "threshold": self.threshold, "min_reliability": self.min_reliability}
 
 
@@ -134,7 +134,7 @@ def make_query(
             None is the threshold of `default_rule` for the default rule of the field. For other rules, it is that of
             `RELEVANCY_RULES` if the rule needs negatives, else "auto", because no threshold suits all encoders.
         min_reliability: Minimum reliability R of a selected Gaussian, in 0..1.
-        refined: Use refined features.
+        refined: Use refined directions.
     Raises:
         ValueError: An argument is not valid, or the encoder cannot encode a prompt, for instance because it is empty.
     """
@@ -204,7 +204,7 @@ def _check_rules(negatives: object, relevancy: str, threshold: object) -> None:
 
 
 QUERIES_FILE = "queries.safetensors"
-"""Name of the file of a stored query in the folder of the field. Embeddings are tensors; the rest is metadata."""
+"""Name of the file that stores a query in the folder of a field. The embeddings are tensors; the rest is metadata."""
 _METADATA_KEY, _VECTORS = "question", ("vectors", "negative_vectors")
 _REMEDY = "delete it, or store the query again with: ns-normlift-query --load-config ... --text ... --save-query True"
 
@@ -212,7 +212,7 @@ NonBlankText = Annotated[str, msgspec.Meta(pattern=r"\S")]
 
 
 class _Metadata(msgspec.Struct, forbid_unknown_fields=True, rename={"rule": "form"}):
-    """Content of the JSON metadata in the file: a `Query` without its embeddings."""
+    """JSON metadata of the file: the fields of a `Query`, except the embeddings and `suggest_threshold`."""
 
     texts: Annotated[tuple[NonBlankText, ...], msgspec.Meta(min_length=1)]
     negatives: tuple[NonBlankText, ...]
@@ -255,7 +255,7 @@ def save_query(folder: Path, question: Query) -> Path:
 
 
 def load_query(folder: Path) -> Query | None:
-    """Load the query stored in the folder of a field; return None if it has no stored query.
+    """Load the query stored in the folder of a field; return None if there is none.
 
     Raises:
         ValueError: The file is damaged, contains no query, or does not match the field.
@@ -306,7 +306,7 @@ def _decode(folder: Path, encoded: str, arrays: dict[str, np.ndarray]) -> Query:
 
 
 def _check_encoder(question: Query, manifest: Mapping[str, Any]) -> None:
-    """Raise ValueError if the embeddings are from a different encoder than the field."""
+    """Raise ValueError if the dimension or the encoder of the embeddings differs from that of the field."""
     size, field_encoder = question.embeddings.shape[1], encoder_digest(manifest)
     if size != manifest["dimension"]:
         raise InputError(

@@ -1,7 +1,7 @@
 """Lift of SAM 3 masks, with two regions per prompt and view: inside and outside the mask.
 
 The relevancy of a Gaussian for a prompt is the fraction of its weight inside the masks of the voting views, sum_v E_in
-/ sum_v (E_in + E_out). The weights are those of the rasterizer that trained the scene.
+/ sum_v (E_in + E_out). The weights are those of the rasterizer with which the scene was trained.
 
 The mask of a whole view can be wrong, because SAM 3 misses an object or confuses it with another one. Two rounds
 therefore determine the voting views. In the first round, all views in which SAM 3 found the prompt vote. In the second
@@ -9,8 +9,8 @@ round, a view votes if the weighted intersection over union of its mask and the 
 exceeds one half. It also votes if both are empty. If SAM 3 found the prompt in none of these views, the result is that
 of the first round.
 
-All pixels of a view that does not vote are unlabeled. The lift counts them with `unlabeled="dilute"`, so they lower
-the reliability of the Gaussians that they show. Agreement and reliability are those of `core.lift` for two regions per
+All pixels of a view that does not vote are unlabeled. The lift counts them with `unlabeled="dilute"`, so they lower the
+reliability of the Gaussians that they show. Agreement and reliability are those of `core.lift` for two regions per
 view, inside and outside, with the features (1, 0) and (0, 1).
 """
 
@@ -84,7 +84,7 @@ class MaskEvidence:
     """True for the cells inside the mask of each prompt."""
 
     def answer(self, text: int) -> MaskResult:
-        """Lift the masks of the prompt with this index."""
+        """Lift the masks of the prompt with index `text`."""
         evidence, inside = self.evidence, self.inside[text]
         column, weight = evidence.rows.column.long(), evidence.rows.weight.double()
         row, view = evidence.rows.row_index(), evidence.region_view[column].long()
@@ -128,7 +128,7 @@ def mask_evidence(
         valid_pixels: Mask of the pixels to use in each view; None for all pixels.
         options: `rasterize_mode` and `settings` of `rasterize_evidence`.
     Raises:
-        ValueError: There are no cameras, or the masks do not match the number or size of the cameras.
+        ValueError: There are no cameras or prompts, or the masks do not match the cameras in number or size.
     """
     if len(cameras) == 0 or len(masks) != len(cameras):
         raise InputError(
@@ -164,12 +164,12 @@ class SegmentationResult(NamedTuple):
     """Minimum reliability R of a selected Gaussian, in 0..1."""
 
     def selected(self, text: int) -> Bool[Tensor, " n"]:
-        """Return the mask of sufficiently reliable Gaussians with more than half of their weight inside the masks."""
+        """Return a mask of the sufficiently reliable Gaussians with most of their weight inside the SAM 3 masks."""
         answer = self.answers[text]
         return answer.mask & (answer.scalars.reliability >= self.min_reliability)
 
     def summarize(self, means: Float[Tensor, "n 3"], selected: Bool[Tensor, "n q"]) -> list[dict[str, Any]]:
-        """Return the numbers of every prompt as plain Python types.
+        """Return summary statistics of every prompt as plain Python types.
 
         Args:
             means: Centers of the Gaussians.
@@ -216,7 +216,7 @@ def query_sam3(
         texts: Prompts.
         views: Maximum number of views.
         min_reliability: Minimum reliability R of a selected Gaussian, in 0..1.
-        settings: Constants of the rasterizer.
+        settings: Rasterizer settings (default: those of gsplat 1.4).
         device: Device of the rasterizer.
     Raises:
         FileNotFoundError: An image does not exist.

@@ -1,7 +1,7 @@
-"""Summaries of many prompts together, for answers on a GPU. They equal those of `Finding.to_json` up to rounding.
+"""Summaries of many prompts, computed together on a GPU. They equal those of `Finding.to_json` up to rounding.
 
-The sums, sorts and counts over Gaussians are operations on blocks of prompts. Only a few numbers per prompt leave the
-GPU, from which `query.threshold` computes the rest.
+Sums, sorts and counts over Gaussians are operations on blocks of prompts. Only a few numbers per prompt are copied to
+the CPU, where `query.threshold` computes the rest.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def summarize(
     """Return the entries of `query.engine.Finding.to_json` for each prompt, except text, verdict and read_as.
 
     Args:
-        valid: True for Gaussians that have a direction; at least one has.
+        valid: True for Gaussians that have a direction, of which there must be at least one.
         threshold: Relevancy above which a Gaussian is selected, for the histograms.
         positions: Result of `suggested_range`.
     """
@@ -72,7 +72,7 @@ def summarize(
 
 
 def _histograms(values: Float[Tensor, "q m"], threshold: float, positions: tuple[float, float]) -> list[Histogram]:
-    """Return the histogram of each prompt from relevancies in ascending order."""
+    """Return the histogram of each prompt from its relevancies in ascending order."""
     count, exact = values.shape[1], values.double()
 
     def count_below(edges: Float64[np.ndarray, "q e"]) -> Int64[np.ndarray, "q e"]:
@@ -83,7 +83,7 @@ def _histograms(values: Float[Tensor, "q m"], threshold: float, positions: tuple
 
 
 def _weighted_means(chosen: Bool[Tensor, "q n"], weighted: Float64[Tensor, "n 5"]) -> list[list[float]]:
-    """Return the weighted mean center and reliability of the Gaussians that each prompt chooses.
+    """Return the weighted mean of x, y, z and R over the Gaussians that are chosen for each prompt.
 
     Args:
         weighted: x, y, z and R of every Gaussian, multiplied by its weight, and the weight itself.
@@ -95,10 +95,10 @@ def _weighted_means(chosen: Bool[Tensor, "q n"], weighted: Float64[Tensor, "n 5"
 def _extents(
     chosen: Bool[Tensor, "q n"], ascending: Sequence[tuple[Float64[Tensor, " n"], Int64[Tensor, " n"]]]
 ) -> list[list[float]]:
-    """Return the distances between the quantiles of the chosen centers along each axis.
+    """Return, for each prompt, the distance along each axis between the quantiles `_CENTRAL` of the chosen centers.
 
     Args:
-        ascending: The coordinates in ascending order and the Gaussian of each, one pair per axis.
+        ascending: Sorted coordinates of all centers and the indices that sort them, one pair per axis.
     """
     extents = []
     for values, order in ascending:

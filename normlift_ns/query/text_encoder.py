@@ -26,7 +26,7 @@ from normlift_ns.io.atomic import text_digest
 from normlift_ns.options import CANONICAL_NEGATIVES, RelevancyRule, SourceOptions, names_of_0_2, option_name
 
 ENCODER_KEYS = ("encoder", "encoder_model", "encoder_pretrained", "crop_fill", "text_template", "text_vectors")
-"""Options that determine the encoder or the text embeddings of a field, by the names in manifests (version 0.2)."""
+"""Options that determine the encoder or text embeddings of a field, under their names in manifests (version 0.2)."""
 PRECOMPUTED = "given"
 """Encoder name in the manifest for features provided by the user."""
 _CHOSEN = "texts_chosen"
@@ -34,7 +34,7 @@ _CHOSEN = "texts_chosen"
 
 
 class DefaultRule(NamedTuple):
-    """Default relevancy rule of an encoder, with negatives and threshold. "auto" means the suggested threshold."""
+    """Default relevancy rule of a field, with negatives and threshold. "auto" stands for the suggested threshold."""
 
     rule: RelevancyRule
     negatives: tuple[str, ...]
@@ -135,7 +135,8 @@ def _cached_texts(
 ) -> CachedTextEncoder:
     """Return a text encoder with a cache.
 
-    It loads its network for new prompts, and raises InputError if the network is not that of the lift.
+    It loads its network for prompts that are not in the cache, and raises InputError if the network is not that of the
+    lift.
     """
 
     def network() -> Any:
@@ -173,7 +174,7 @@ def encoder_digest(manifest: Mapping[str, Any]) -> str | None:
 
 
 def _check_vectors(path: Path, expected: object) -> None:
-    """Read a whole file of text embeddings, and raise if its content has changed since the lift."""
+    """Raise if a file of text embeddings is missing, or its content has changed since the lift."""
     remedy = (
         f"restore the file, set {option_name('text_embeddings')} to a file of text embeddings from the same network, "
         "or lift again with: ns-normlift"
@@ -204,14 +205,14 @@ def _options(field: HasManifest) -> SourceOptions:
 
 
 def encoder_name(field: HasManifest) -> str | None:
-    """Return the documented name of the encoder of a field; None if the manifest does not record it."""
+    """Return the canonical name of the encoder of a field; None if the manifest does not record it."""
     stored = field.manifest.get("encoder")
     name = stored.get("encoder") if isinstance(stored, Mapping) else None
     return canonical_name(name) if isinstance(name, str) else None
 
 
 def own_words(field: HasManifest) -> tuple[str, ...]:
-    """Return the words of the encoder's vocabulary or of the file of text embeddings, without default negatives.
+    """Return the texts of the field's file of text embeddings, without default negatives, or else the encoder's words.
 
     Raises:
         ValueError, FileNotFoundError: The file is damaged or does not exist.
@@ -227,8 +228,8 @@ def own_words(field: HasManifest) -> tuple[str, ...]:
 def default_rule(field: HasManifest) -> DefaultRule:
     """Return the default rule, negatives and threshold of queries of a field.
 
-    The rule is contrast for a field with a null level. For other fields, it is the rule of the encoder. It is
-    cosine if the encoder is unknown, or if a file of text embeddings lacks the default negatives of the encoder.
+    The rule is contrast for a field with a null level. For other fields, it is the rule of the encoder, or cosine if
+    the encoder is unknown or a file of text embeddings lacks the default negatives of the encoder.
     """
     if field.manifest.get("null_words") is not None:
         return _CONTRAST

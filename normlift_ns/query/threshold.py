@@ -1,4 +1,4 @@
-"""Threshold and verdict for the relevancies of a prompt: their histogram, the threshold that it suggests, and presence.
+"""Histogram, suggested threshold and verdict for the relevancies of a prompt.
 
 This module does not need torch.
 """
@@ -21,8 +21,8 @@ from normlift_ns.options import RelevancyRule
 from normlift_ns.query.text_encoder import HasManifest, encoder_name
 
 Verdict = Literal["found", "weak match", "probably not here"]
-"""Presence of a prompt in a scene; see `judge`. With null words, found: the prompt matches better than 90 % of them.
-weak match: it matches better than 70 % of them. probably not here: it does not."""
+"""Presence of a prompt in a scene; see `judge`. With null words, a prompt is "found" if it matches better than at least
+90% of them, and a "weak match" if it matches better than at least 70%."""
 
 
 # Histogram of the relevancies of one prompt, with a suggested threshold.
@@ -40,9 +40,9 @@ weak match: it matches better than 70 % of them. probably not here: it does not.
 
 HISTOGRAM_BINS = 32
 _AT_TOP = 1e-3
-"""Distance below which the median counts as being at the top, as a fraction of the range from minimum to top."""
+"""Distance from the top below which the median counts as at the top, as a fraction of the range from minimum to top."""
 _EPSILON = 1e-6
-"""Smallest width of a histogram, and distance of the suggested threshold below the top if all relevancies are equal."""
+"""Minimum width of a histogram, and distance of the suggested threshold below u (see above) if m and u are equal."""
 _SMALLEST_OBJECT = 20
 """Number of Gaussians that exceed u (see above) if the scene has 20,000 or more."""
 _STABLE_OVER = 0.2
@@ -71,14 +71,14 @@ class Histogram:
     threshold: float
     """Relevancy above which a Gaussian is selected."""
     median: float
-    """Median relevancy; the smallest one if more than half of the Gaussians are at the top."""
+    """Median relevancy, or the smallest relevancy if more than half of the Gaussians are at the top."""
     top: float
     """Relevancy that one Gaussian in a thousand exceeds."""
     suggested: float
     """Suggested threshold for this prompt."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the range, counts and statistics as plain Python types."""
+        """Return the range, counts, median and top as plain Python types."""
         low, high = float(self.edges[0]), float(self.edges[-1])
         statistics = {"median": self.median, "top": self.top}
         return {"low": low, "high": high, "counts": self.counts.tolist(), **statistics}
@@ -100,7 +100,7 @@ def relevancy_histogram(
 
 
 def _histogram(values: Float64[np.ndarray, " n"], threshold: float, positions: tuple[float, float]) -> Histogram:
-    """Return the histogram of relevancies in ascending order; see `relevancy_histogram`."""
+    """Return the histogram of relevancies that are sorted in ascending order; see `relevancy_histogram`."""
 
     def count_below(edges: Float64[np.ndarray, "1 e"]) -> Int64[np.ndarray, "1 e"]:
         return np.searchsorted(values, edges[0])[None]
@@ -131,7 +131,7 @@ def make_histograms(
     """Return the histogram of each prompt.
 
     Args:
-        picked: Relevancies of the ranks `picked_ranks(count)`.
+        picked: Relevancies of each prompt at the ranks `picked_ranks(count)`.
         count_below: Function that returns the number of relevancies of each prompt that are below each edge.
         count: Number of Gaussians with a direction, at least 1.
         threshold: Relevancy above which a Gaussian is selected.
@@ -163,7 +163,7 @@ def _interpolate(
 
 
 def _ascending(values: Float[np.ndarray, ...]) -> Float64[np.ndarray, " n"]:
-    """Return the values in ascending order, so that counts and quantiles are fast."""
+    """Return the values as a flat float64 array in ascending order."""
     return np.sort(values, axis=None).astype(np.float64)
 
 
@@ -183,7 +183,7 @@ def draw_histogram(
 
 
 def suggested_range(field: HasManifest) -> tuple[float, float]:
-    """Return the range of f, the position of a suggested threshold from m (0) to u (1), for the field's encoder."""
+    """Return the range of suggested thresholds for the encoder of a field; see `EncoderKind.suggested`."""
     kind = find_encoder_kind(encoder_name(field))
     return EncoderKind.suggested if kind is None else kind.suggested
 
@@ -217,7 +217,7 @@ def _suggest(
     Args:
         edges: Relevancies from m to u in equal steps.
         above: Number of Gaussians at or above each edge.
-        top: The top t.
+        top: Relevancy that one Gaussian in a thousand exceeds.
     """
     if top <= 0:
         return top  # if nothing is relevant, select nothing
@@ -265,7 +265,7 @@ def compares_cosines(manifest: Mapping[str, Any], encoder: str | None) -> bool:
 def judge(
     manifest: Mapping[str, Any], encoder: str | None, rule: RelevancyRule, *, top_cosine: float, top: float
 ) -> Verdict | None:
-    """Return the verdict on a prompt; None without null words, limits or negatives to compare with.
+    """Return the verdict on a prompt; None if neither the encoder, the null words nor the rule define limits for it.
 
     Args:
         manifest: Manifest of the field.
