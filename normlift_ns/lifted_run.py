@@ -112,7 +112,7 @@ class LiftedRun:
 
     @property
     def features(self) -> Float[Tensor, "n d"]:
-        """Unit direction of every Gaussian after the vote, 0 if it has none; computed on every access."""
+        """Unit direction of every Gaussian after the vote, or zeros if it has none; computed on every access."""
         return self.field.directions()
 
     @property
@@ -169,7 +169,7 @@ class LiftedRun:
             refined: Use the directions after the vote.
         Raises:
             ValueError: No prompt is given, a prompt is empty, the encoder cannot encode a prompt, or an option is
-                invalid. Also if a vector has another number of values than the features, is zero or is not finite.
+                invalid. Also if a vector differs in length from the features, is zero or is not finite.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -198,7 +198,7 @@ class LiftedRun:
         return run_query(self.field, self.scene.gaussians.means, question)
 
     def _checked(self, name: str, vector: Float[Tensor, " d"]) -> Float64[np.ndarray, " d"]:
-        """Return the vector of a prompt as a NumPy array."""
+        """Check the vector of a prompt, and return it as a NumPy array."""
         row = vector.detach().double().cpu().numpy()
         if row.shape != (self.field.dimension,):
             raise InputError(
@@ -221,7 +221,7 @@ class LiftedRun:
         ns-render and ns-viewer then show the relevancy of its prompts.
 
         Raises:
-            ValueError: The query is not valid, or its vectors have another number of values than the features.
+            ValueError: The query is not valid, or its vectors differ in length from the features.
             FileNotFoundError: The run was moved or deleted.
         """
         question = question.question if isinstance(question, Answer) else question
@@ -265,8 +265,8 @@ class LiftedRun:
             The row indices of the written Gaussians, in the order of the file.
         Raises:
             FileExistsError: A file exists and `overwrite` is False.
-            ValueError: No Gaussian of `part` is visible, or the mask has the wrong type or length. Also if the name is
-                reserved for files of a run, or the options of objects are given without an answer.
+            ValueError: No Gaussian of `part` is visible, or the mask has the wrong type or length. Also if the export
+                would replace an input or a file of a run, or the options of objects are given without an answer.
         """
         path = check_path("path", path)
         if path.name in ("", ".."):
@@ -351,8 +351,8 @@ class LiftedRun:
         Raises:
             FileNotFoundError: The cloud does not exist, or the run has no dataparser_transforms.json for "capture".
             FileExistsError: A file exists and `overwrite` is False.
-            ValueError: `part` has no answer, the cloud is not a PLY file or already has properties of these names, or
-                the distance is not positive.
+            ValueError: `part` has no answer, the cloud is not a PLY file or already has properties with the names of
+                labels, or the distance is not positive.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -378,7 +378,7 @@ class LiftedRun:
 
     @cached_property
     def votes(self) -> RecordedVotes:
-        """Evidence of the lift for each training image.
+        """Votes of the images that were lifted.
 
         `votes.pictures(why.views[:3])` yields the three images with the largest weight, with outlines of the regions
         that voted.
@@ -415,8 +415,8 @@ class LiftedRun:
     ) -> Catalogue:
         """List the objects of a selection, in the coordinates of the capture and in those of the scene.
 
-        Each object has a number, size, oriented box, centroid, extent, reliability R and the images that show it.
-        docs/objects.md explains every value.
+        Each object has a number, a size, an oriented box, a centroid, an extent, a reliability R, the number of images
+        that show it, and the names of up to three of them. docs/objects.md explains every value.
 
         Args:
             part: Answer or finding that selects the Gaussians, or a mask of Gaussians. Objects of a mask have no text.
@@ -534,8 +534,8 @@ class LiftedRun:
         Args:
             view: Index or name of the image. The folder and the suffix may be omitted.
         Raises:
-            ValueError: Several images have this name, or no image has it. The error for no image is also a KeyError and
-                an IndexError.
+            ValueError: Several images have this name, or no image has this name or index. The error for a missing image
+                is also a KeyError and an IndexError.
         """
         cameras, names = self.scene.train.cameras, self.scene.train.names
         if not isinstance(view, str | Path):
@@ -579,7 +579,7 @@ class LiftedRun:
 
     @check_arguments
     def image(self, view: str | Path | int | Camera, found: Answer | Finding | None = None) -> Image.Image:
-        """Return `render` as a PIL image, with methods such as `save` and `show`.
+        """Render the scene as `render` does, and return a PIL image.
 
         Args:
             view, found: As in `render`.
@@ -652,10 +652,11 @@ def write_run(
 
     The directory contains config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model,
     without optimizers), dataparser_transforms.json, and the field in normlift/. A run without a nerfstudio source run
-    also has its cameras in transforms.json, and the other settings that reopen it in splat.json.
+    also has its cameras in transforms.json, and the other settings needed to open it in splat.json.
 
-    Relative paths in the config of the source run stay relative. nerfstudio's own commands must therefore run in the
-    directory in which the source run was trained. The ns-normlift commands run in any directory.
+    Relative paths in the config of the source run stay relative, so nerfstudio's own commands must run in the directory
+    in which the source run was trained. The path of the dataset becomes absolute if the dataset was moved or the new
+    run is outside that directory. The ns-normlift commands run in any directory.
 
     Args:
         run_dir: Directory from `run_directory`, output_dir/experiment/normlift/timestamp.

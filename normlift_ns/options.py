@@ -196,7 +196,7 @@ def new_names(options: Any, stored: Mapping[str, Any]) -> dict[str, Any]:
 def names_of_0_2(options: Any) -> dict[str, Any]:
     """Return options as a dictionary with the names of version 0.2.
 
-    Keys of batches and the encoder entry of manifests still use these names.
+    The capture keys of batches and the encoder entry of manifests still use these names.
     """
     old_names = {new: old for old, new in getattr(options, "old_names", {}).items()}
     values = {old_names.get(field.name, field.name): getattr(options, field.name) for field in fields(options)}
@@ -284,7 +284,7 @@ def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -
 
 
 def check_bool(name: str, value: object) -> None:
-    """Raise InputError unless the value is True or False. Strings raise too, because even "False" is truthy."""
+    """Raise InputError unless the value is True or False. Strings are not converted, because even "False" is truthy."""
     if not isinstance(value, bool):
         raise _error(name, "True or False", value)
 

@@ -91,7 +91,7 @@ class Measurements:
     preparation_s: Mapping[str, float]
     """Seconds of the steps before the views, by name (start, open, kernels, check). The lift repeats these steps."""
     load_s: float
-    """Seconds to load the network."""
+    """Seconds to load the networks."""
     features_s: float | None
     """Seconds per view with new features; None if all are cached."""
     cached_features_s: float | None
@@ -119,12 +119,12 @@ class Measurements:
     device_bytes: int | None
     """Peak GPU memory up to the end of the evidence stage, in bytes; None without a GPU."""
     measured_views: int = 0
-    """Number of measured views."""
+    """Number of views that the measurement processed."""
 
 
 @dataclass(frozen=True)
 class PlannedStage:
-    """Planned stage of a lift."""
+    """Stage of a planned lift, with its estimated time."""
 
     name: str
     seconds: float
@@ -217,7 +217,7 @@ def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
 
 
 def _share_of(views: int, share: float) -> int:
-    """Round a share of two or more views to a number, which is 0 only for share 0 and `views` only for share 1.
+    """Convert a share of two or more views to a number, which is 0 only for share 0 and `views` only for share 1.
 
     >>> _share_of(45, 0.999), _share_of(45, 1.0), _share_of(45, 0.0)
     (44, 45, 0)
@@ -241,7 +241,7 @@ _LARGE_SAMPLE = {"cpu": 2**13, "cuda": 2**18}
 _SAMPLE_RATIO = 4
 """Size of the larger sample divided by that of the smaller one."""
 _MAX_SAMPLE_VIEWS = 64
-"""Maximum number of views in the samples. The cost of further views is extrapolated."""
+"""Approximate maximum number of views in the samples. The cost of further views is extrapolated."""
 
 
 def measure_core(
@@ -331,7 +331,7 @@ _PROJECTED_GAUSSIANS = 100_000
 _FEW_IN_VIEW, _NONE_IN_VIEW = 0.5, 0.001
 """Shares of Gaussians in view below which the check warns, and below which it fails."""
 _HIGH_SHARE = 0.8
-"""An estimate gets a warning if it takes more than this share of the free memory or disk space."""
+"""Share of the free memory or disk space above which an estimate gets a warning."""
 _LIFT_LESS = "increase --lift-downscale, reduce --max-views"
 _SHOWN_PACKAGES = ("torch", "numpy", "nerfstudio", "gsplat", "open_clip_torch")
 
@@ -533,7 +533,7 @@ _MAX_LOOKUPS = 16
 
 
 class _Observed(NamedTuple):
-    """Observed views, with the seconds of the observation."""
+    """Batch of views, with the seconds to compute its labels and features."""
 
     block: evidence_collection.ViewBatch
     seconds: float
@@ -648,7 +648,7 @@ def _per_view(observed: _Observed) -> float | None:
 def _observe_loaded(
     indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed], batch: int
 ) -> tuple[_Observed, float]:
-    """Observe views; return them with the seconds that loaded networks need, and the seconds to load networks."""
+    """Observe views; return them with the seconds needed once networks are loaded, and the seconds to load networks."""
     if len(indices) == 0:
         return _Observed(evidence_collection.ViewBatch([], [], [], []), 0.0), 0.0
     first = observe(indices[:1])
@@ -669,7 +669,7 @@ def _joined(blocks: Sequence[evidence_collection.ViewBatch], most: int | None = 
 def _evidence_cached(
     collection: evidence_collection.EvidenceCollection, groups: Sequence[tuple[evidence_collection.ViewBatch, int]]
 ) -> float:
-    """Return the share of views whose evidence is cached.
+    """Estimate the share of the views whose evidence is cached.
 
     Args:
         groups: Batches of sample views, each with the number of views that it represents.

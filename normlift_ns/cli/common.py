@@ -220,7 +220,7 @@ def _output_errors() -> Iterator[None]:
 
 _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
 CONSOLE = Console(**_PLAIN)
-"""Console for results on standard output. It prints markup in texts literally."""
+"""Console for results on standard output. It prints markup literally."""
 if CONSOLE.is_terminal:  # tables fit the terminal; pipes and files get the full width
     CONSOLE.width = max(40, min(CONSOLE.width, shutil.get_terminal_size().columns))
 ERROR_CONSOLE = Console(**_PLAIN, stderr=True)
@@ -570,5 +570,5 @@ def field_docstrings(options: Any) -> dict[str, str]:
 
 
 def first_paragraph(options: Any) -> str:
-    """Return the first paragraph of a docstring as one line."""
+    """Return the first paragraph of the docstring of a class as one line."""
     return " ".join((options.__doc__ or "").split("\n\n")[0].split())

@@ -43,7 +43,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 
 @contextmanager
 def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
-    """Join the other processes of the lift. Only the first process prints.
+    """Join the process group of a distributed lift, in which only the first process prints.
 
     Args:
         device: Value of --device.
@@ -333,8 +333,8 @@ def frequent_switches() -> Iterator[None]:
 def load_drivers(device: str) -> None:
     """Start to initialize CUDA and to load Triton in background threads, while torch is imported.
 
-    Torch would do both later, and hold Python's global lock. Errors are ignored here. They occur again at the first use
-    of the GPU.
+    torch would do both later, and hold Python's global interpreter lock. Errors are ignored here. They occur again at
+    the first use of the GPU.
 
     Args:
         device: Device to lift on: cpu, cuda, cuda:N or auto.

@@ -1,6 +1,6 @@
 """Method specifications for nerfstudio's entry points, or None if a method cannot be loaded.
 
-Every ns-* command loads all entry points without a try block. An error in one of them would therefore disable the
+nerfstudio's commands load all entry points without a try block. An error in one of them would therefore disable the
 methods of all packages. Here, it is printed to standard error instead. nerfstudio ignores objects that are not a
 MethodSpecification.
 """
