@@ -94,13 +94,13 @@ class ViewObservations(NamedTuple):
 
     @staticmethod
     def of_block(block: ViewBatch, evidence: Evidence) -> ViewObservations:
-        """Combine the evidence of a block with the features and levels of its regions."""
+        """Combine the evidence of a batch of views with the features and levels of its regions."""
         levels = [region_levels(regions, len(rows)) for regions, rows in zip(block.regions, block.features)]
         return ViewObservations(evidence, torch.cat(block.features), torch.cat(levels))
 
     @staticmethod
     def merge(parts: Iterable[ViewObservations]) -> ViewObservations:
-        """Concatenate several groups of views, in the given order."""
+        """Concatenate the observations of several groups of views, in the given order."""
         evidence, features, level = zip(*parts)
         return ViewObservations(Evidence.merge(*evidence), torch.cat(features), torch.cat(level))
 
@@ -318,11 +318,11 @@ def batch_evidence(
     on_view: Callable[[], None],
     wait_for_kernels: Callable[[], None] = lambda: None,
 ) -> Evidence:
-    """Return the evidence of the regions in a block, from the evidence of cells.
+    """Return the evidence of the regions of a batch of views, summed over the cells of each region.
 
     The folder caches the cell evidence of each view. If `reuse` is True, the function reuses the cached evidence of a
     view with the same Gaussians, camera, labels and rasterization settings. The regions and features of the view, and
-    the other views of the block, may differ.
+    the other views of the batch, may differ.
 
     Args:
         on_view: Called after every view.
@@ -351,7 +351,7 @@ def batch_evidence(
 def cached_batch_evidence(
     gaussians: GaussianScene, block: ViewBatch, folder: Path, config: RasterConfig
 ) -> Evidence | None:
-    """Return the evidence of a block from the cache, or None if a view is missing there."""
+    """Return the evidence of the regions of a batch of views from the cache, or None if the cache lacks a view."""
     cached = find_cached_views(folder, evidence_keys(gaussians, block, config))
     return cells_to_regions(join_cached_views(cached), block) if len(cached) == len(block.cameras) else None
 
@@ -486,7 +486,7 @@ def views_in_cache(folder: Path, keys: Sequence[str]) -> list[bool]:
 
 
 def join_cached_views(places: Mapping[int, CachedView]) -> Evidence:
-    """Join the evidence of cached views, in the order of the keys of `places`."""
+    """Join the evidence of cached views, in ascending order of the keys of `places`."""
     runs: list[tuple[Evidence, list[int]]] = []
     for number in sorted(places):
         evidence, view = places[number]

@@ -471,9 +471,9 @@ CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
 VoteKind = Literal["paper", "posterior"]
+"""Kind of vote among neighboring Gaussians; see `RefineConfig`."""
 ReliabilityKind = Literal["paper", "pairs", "angular"]
-"""Kind of reliability to store; see `LiftOptions`. The kind of vote, `VoteKind`, is explained in
-`normlift_ns.refine`."""
+"""Kind of reliability to store; see `LiftOptions`."""
 WithoutDirection = Literal["none", "first"]
 """Class that an evaluation assigns to Gaussians without a direction: no class, or the first class."""
 OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS = 4.0, 20

@@ -540,7 +540,7 @@ class _Observed(NamedTuple):
 
 
 def time_kernel_loading(scene: Scene, options: LiftOptions, *, device: str = "cpu") -> float:
-    """Load or compile the kernels of a lift; return an estimate of the seconds that the next process needs for this."""
+    """Load or compile the kernels of a lift, and estimate the seconds that another process needs to load them."""
     gaussians = scene.gaussians.to(device)
     config = pipeline.choose_raster_config(scene, gaussians, options)
     kernels = pipeline.start_kernel_warm_up(scene, gaussians, options, config)

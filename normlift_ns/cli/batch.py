@@ -436,7 +436,7 @@ def lift_captures(
     on_message: Callable[[str], None] = lambda text: None,
     command: Sequence[str] = LIFT_COMMAND,
 ) -> dict[str, Outcome]:
-    """Lift the captures that are neither lifted nor claimed by another worker, and wait until all lifts have ended.
+    """Lift the captures that are neither lifted nor claimed by a live worker, and wait until all lifts have ended.
 
     Args:
         captures: Captures of this worker.

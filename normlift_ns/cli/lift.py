@@ -232,7 +232,7 @@ class NormLift(CheckedOptions):
                 raise InputError(f"--{name.replace('_', '-')} works only with {needed}. {cure}")
 
     def new_run_location(self) -> tuple[str | None, Path | None]:
-        """Return the capture name and output folder for `run_directory`; None if they are not known yet.
+        """Return the capture name and output folder for `run_directory`, each None if it is not known yet.
 
         Raises:
             InputError, OSError: The config is invalid or cannot be read.

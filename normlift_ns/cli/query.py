@@ -243,9 +243,9 @@ class NormLiftQuery(CheckedOptions):
         return lambda: save_overlays(scene, result, cameras, folder, **shared)
 
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
-        """Add explanations to the rows, write the images of --explain-dir, and return a function that prints a table.
+        """Add explanations to the rows, and write the images of --explain-dir.
 
-        The explanation is None for a prompt that selects nothing.
+        The explanation is None for a prompt that selects nothing. Return a function that prints the explanations.
         """
         import torch  # noqa: PLC0415
 

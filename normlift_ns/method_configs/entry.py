@@ -14,7 +14,7 @@ from typing import Any
 
 
 def _rename_flags(words: list[str]) -> list[str]:
-    """Replace old names of options in the command line of this process, if it is ns-train with a normlift method."""
+    """Replace old option names in a command line of ns-train with a normlift method; leave others unchanged."""
     from normlift_ns.options import LiftOptions, SourceOptions, rename_flags, renamed_flags  # noqa: PLC0415 (may fail)
 
     if Path("".join(words[:1])).stem != "ns-train" or not "".join(words[1:2]).startswith("normlift"):
