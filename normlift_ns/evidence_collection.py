@@ -86,7 +86,7 @@ class RasterConfig:
 
 
 class ViewObservations(NamedTuple):
-    """Evidence of some views, with the features and levels of their regions."""
+    """Evidence of one or more views, with the features and levels of their regions."""
 
     evidence: Evidence
     features: Float[Tensor, "s d"]
@@ -403,7 +403,7 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     """Check that the label map of an undistorted image was not made from the original, distorted image.
 
     Undistortion crops an image by a few pixels, but may move its content by many. A map of a different size may
-    therefore show the distorted image, so the function accepts only maps of exactly the undistorted size.
+    therefore show the distorted image, so the function accepts only maps that have the size of one of the views.
 
     Args:
         views: The same view at every size that the label map may have.
@@ -534,7 +534,7 @@ def _cache_headers(folder: Path) -> dict[Path, list[str]]:
 
 @lru_cache(_CACHED_HEADERS)
 def _cache_header(path: str, modified: int, size: int) -> str:
-    """Return the view keys in the header of a file, separated by spaces; empty if the file is damaged."""
+    """Return the view keys in the header of a file, separated by spaces; empty if the file is missing or damaged."""
     try:
         return read_metadata(Path(path)).get(_VIEWS, "")
     except (FileNotFoundError, ValueError):

@@ -34,7 +34,7 @@ _MIN_DIVISOR = 1e-6
 MAX_PROMPT_LENGTH = 10_000
 """Maximum number of characters in a prompt. CLIP encodes only about the first 70 words."""
 _INVALID = re.compile("[\0\ud800-\udfff]")
-"""Characters that prompts and text options cannot have: NUL, and surrogates, which UTF-8 cannot encode."""
+"""Characters that prompts and text options must not contain: NUL, and surrogates, which UTF-8 cannot encode."""
 _IMPOSSIBLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR)
 """Error numbers for a name that is too long, a loop of links, and a file that is used as a folder."""
 _hints = cache(get_type_hints)

@@ -143,8 +143,8 @@ def lift_run(
         output_dir: Output folder, instead of the outputs folder of the trained run.
         timestamp: Name of the new run directory. If None, use the current time, with a number if such a run exists.
         overwrite: Replace an existing run directory of that name. For exported files, see `FeatureExport.overwrite`.
-        check_alignment: Compare a few training images with renders of the scene before the lift. Warn if they differ,
-            and raise if they do not show the same scene.
+        check_alignment: Compare a few training images with renders of the scene before the lift. Warn if they differ.
+            Raise if they show almost no Gaussians or, for a splat without a nerfstudio run, another scene.
         device: Device to lift on: auto, cpu or cuda.
         export: Destination of a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: Progress callback, called with (stage, steps done, total steps).
@@ -330,7 +330,7 @@ def announce(prepared: PreparedLift) -> None:
 def compare_with_images(
     scene: Scene, options: LiftOptions, device: str, measure: Callable[..., Alignment] = measure_alignment
 ) -> str | None:
-    """Compare renders with training images; return a warning if they differ, or raise if they show different scenes.
+    """Compare renders with training images; return a warning if they differ, or raise as `alignment_warning` does.
 
     Args:
         measure: Function that measures the agreement.

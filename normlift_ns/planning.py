@@ -47,7 +47,7 @@ from normlift_ns.segmentation.registry import resolve_source
 
 
 _EVIDENCE_COPIES = 3
-"""Number of copies of the evidence in memory while the parts of all blocks are joined and converted to regions."""
+"""Number of copies of the evidence in memory while the evidence of all batches is joined and converted to regions."""
 _DIRECTION_COPIES = 2
 """Number of copies of the directions in memory while the vote gathers them and a storage format is chosen."""
 _OFFSET_BYTES = 16
@@ -235,7 +235,7 @@ def _cached(cached: int, views: int) -> str:
 
 
 Clock = Callable[[], float]
-"""Clock that returns seconds."""
+"""Function that returns the current time in seconds."""
 _LARGE_SAMPLE = {"cpu": 2**13, "cuda": 2**18}
 """Number of Gaussians in the larger sample, by device."""
 _SAMPLE_RATIO = 4
@@ -485,7 +485,7 @@ def diagnose_weights(missing: Sequence[str], options: SourceOptions, device: str
 
 
 def diagnose_memory(plan: Plan, device: str) -> list[Diagnostic]:
-    """Check that the lift fits into memory."""
+    """Check that the lift fits into memory and, on a GPU, into GPU memory."""
     rows = []
     free = min(free_memory().values(), default=None)
     if free is not None:
@@ -661,7 +661,7 @@ def _observe_loaded(
 
 
 def _joined(blocks: Sequence[evidence_collection.ViewBatch], most: int | None = None) -> evidence_collection.ViewBatch:
-    """Join the views of all blocks, up to `most` views."""
+    """Join batches of views, up to `most` views in total."""
     parts = zip(evidence_collection.ViewBatch([], [], [], []), *blocks)
     return evidence_collection.ViewBatch(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
 

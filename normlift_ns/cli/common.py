@@ -529,7 +529,7 @@ def _plain_warnings() -> Iterator[None]:
 
 @cache
 def add_help_texts(options: Any, *, nested: bool = False) -> Any:
-    """Return an options dataclass with help texts from its docstrings.
+    """Add help texts from docstrings to an options dataclass, and return the dataclass.
 
     The docstring under each field becomes the help of its flag. The first paragraph of a class docstring becomes the
     help of its group. tyro reads docstrings itself, but keeps the line breaks of the source. Options nested in a group
@@ -553,7 +553,7 @@ def add_help_texts(options: Any, *, nested: bool = False) -> Any:
 
 @cache
 def _class_definitions(module: str) -> dict[str, list[ast.stmt]]:
-    """Return the statements of every class at the top level of a loaded module; none without its source."""
+    """Return the statements of each top-level class of a loaded module, by class name; empty without its source."""
     with suppress(OSError, TypeError):  # TypeError: the module has no file
         tree = ast.parse(inspect.getsource(sys.modules[module]))
         return {node.name: node.body for node in tree.body if isinstance(node, ast.ClassDef)}
