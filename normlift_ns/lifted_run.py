@@ -117,7 +117,7 @@ class LiftedRun:
 
     @property
     def scalars(self) -> Scalars:
-        """Reliability, norm, weight and the other numbers of every Gaussian; see `normlift_ns.Scalars`."""
+        """Reliability, norm, weight and other statistics of every Gaussian; see `normlift_ns.Scalars`."""
         return self.field.scalars
 
     @property
@@ -251,16 +251,16 @@ class LiftedRun:
         labels, and the names of its classes and objects are written to <stem>_names.json.
 
         Args:
-            path: File to write. Names that end with .glb, .spz or .compressed.ply select these formats, and all other
-                names select PLY.
+            path: File to write. The endings .glb, .spz and .compressed.ply select the format. Other endings select PLY,
+                except .splat, .sog, .ksplat and .gltf, which are not supported.
             part: Answer or finding that selects the Gaussians, or a mask of Gaussians. If None, write the whole scene.
             answer: Answer that provides relevancies, class_id and instance_id. If None, use the answer of `part`, if
                 there is one.
             objects: Table to write to <stem>_objects.json, with JSON types only.
             object_max_gap: Maximum gap between Gaussians of one object, as in `find_objects`.
             object_min_gaussians: Minimum number of Gaussians in an object, as in `find_objects`.
-            overwrite: Replace files of these names, and remove an earlier <stem>_names.json or <stem>_objects.json that
-                this export does not write.
+            overwrite: Replace existing files, and remove an earlier <stem>_names.json or <stem>_objects.json that this
+                export does not write.
         Returns:
             The row indices of the written Gaussians, in the order of the file.
         Raises:
@@ -309,7 +309,7 @@ class LiftedRun:
             folder: Folder to write to.
             part: Answer or finding that selects the Gaussians, or a mask of Gaussians.
             rest: Invert the masks. Empty pixels are then 255.
-            overwrite: Replace files of these names.
+            overwrite: Replace existing files of the same names.
         Raises:
             FileExistsError: A file exists and `overwrite` is False.
             ValueError: The mask has the wrong type or length.
@@ -347,7 +347,7 @@ class LiftedRun:
                 spacing of the Gaussians.
             coordinates: Coordinate system of the cloud. "capture" is that of the original cameras, before the training
                 rotated and scaled them, and "scene" is that of the Gaussians.
-            overwrite: Replace a file of that name.
+            overwrite: Replace an existing file.
         Raises:
             FileNotFoundError: The cloud does not exist, or the run has no dataparser_transforms.json for "capture".
             FileExistsError: A file exists and `overwrite` is False.
@@ -651,8 +651,8 @@ def write_run(
     """Write a lifted run, completely or not at all, and return its directory.
 
     The directory contains config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model,
-    without optimizers), dataparser_transforms.json, and the field in normlift/. A run without a nerfstudio source run
-    also has its cameras in transforms.json, and the other settings needed to open it in splat.json.
+    without optimizers), dataparser_transforms.json, and the field in normlift/. For a splat without a nerfstudio
+    run, it also contains the cameras in transforms.json, and the other settings needed to open the run in splat.json.
 
     Relative paths in the config of the source run stay relative, so nerfstudio's own commands must run in the directory
     in which the source run was trained. The path of the dataset becomes absolute if the dataset was moved or the new

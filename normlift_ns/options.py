@@ -30,7 +30,7 @@ from normlift_ns.registry import installed_names
 _MAX_INT, _MAX_FLOAT = 2**31 - 1, 1e30
 """Default upper bounds of integer and float options. They prevent overflow in int32 and float32."""
 _MIN_DIVISOR = 1e-6
-"""Lower bound of most positive options, because some of them are used as divisors."""
+"""Lower bound of most positive options, because some of these options are divisors."""
 MAX_PROMPT_LENGTH = 10_000
 """Maximum number of characters in a prompt. CLIP encodes only about the first 70 words."""
 _INVALID = re.compile("[\0\ud800-\udfff]")

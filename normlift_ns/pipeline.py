@@ -414,7 +414,7 @@ class LiftResult(NamedTuple):
     field: SemanticField
     seconds: dict[str, float]
     """Duration of each stage, in order: features, evidence, consensus, recognition, lift, neighbors, vote, store.
-    Stages that the options disable are left out."""
+    Stages that the options disable are left out. A lift in several processes also has exchange, after evidence."""
 
 
 def lift_scene(

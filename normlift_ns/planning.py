@@ -306,7 +306,7 @@ def measure_core(
 
 
 def _rate(small: tuple[float, float], large: tuple[float, float], count: float) -> Rate:
-    """Fit a line to two pairs (items, cost). It passes through the larger pair; slope and fixed part are >= 0."""
+    """Fit a line to two pairs (items, cost). The line passes through `large`; slope and fixed part are >= 0."""
     (items, cost), (more, most) = small, large
     each = (most - cost) / (more - items) if more > items else most / max(1.0, more)
     each = min(max(each, 0.0), most / max(1.0, more))
@@ -388,7 +388,7 @@ def describe_recognition(facts: Mapping[str, Any]) -> str:
 def diagnose_recognition(run_dirs: Iterable[Path]) -> list[Diagnostic]:
     """Report how well the first lifted run in the given folders recognizes regions of left-out views.
 
-    The numbers are those of its manifest. If no folder contains a lifted run, return an empty list.
+    The numbers come from its manifest. If no folder contains a lifted run, return an empty list.
 
     Args:
         run_dirs: Folders that may contain a lifted run.
