@@ -219,7 +219,7 @@ def renamed_flags(options: Any, prefix: str = "--") -> dict[str, str]:
 
 
 def rename_flags(words: Sequence[str], flags: Mapping[str, str]) -> list[str]:
-    """Replace old flags in a command line by new ones, and print one line per old flag on standard error.
+    """Replace old flags in a command line with new ones, and print one line per old flag on standard error.
 
     Args:
         words: Command line. Words after "--" belong to another command and stay unchanged.

@@ -60,7 +60,7 @@ class Capture:
 
 
 def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
-    """Read the captures of a list, in the order of the list.
+    """Read a capture list, and return its captures in order.
 
     Args:
         path: Text file. Each line has the path of a config.yml, a splat file or a gsplat checkpoint. Options of

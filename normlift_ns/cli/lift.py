@@ -267,9 +267,9 @@ class NormLift(CheckedOptions):
 
 @contextmanager
 def progress_bars() -> Iterator[ProgressCallback]:
-    """Show a progress bar for each stage, or print a line if the output goes to a pipe or a log file.
+    """Yield a callback that shows a progress bar for each stage, or prints a line to a pipe or log file.
 
-    With --quiet, nothing is printed.
+    With --quiet, the callback prints nothing.
     """
     names = {"features": "2D features", "lift": "lift, reliability", "store": "choosing storage"}
     columns = (
@@ -333,8 +333,8 @@ def frequent_switches() -> Iterator[None]:
 def load_drivers(device: str) -> None:
     """Start to initialize CUDA and to load Triton in background threads, while torch is imported.
 
-    torch would do both later, and hold Python's global interpreter lock. Errors are ignored here. They occur again at
-    the first use of the GPU.
+    Otherwise, torch would do both later, and hold Python's global interpreter lock. Errors are ignored here. They occur
+    again at the first use of the GPU.
 
     Args:
         device: Device to lift on: cpu, cuda, cuda:N or auto.

@@ -243,9 +243,9 @@ class NormLiftQuery(CheckedOptions):
         return lambda: save_overlays(scene, result, cameras, folder, **shared)
 
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
-        """Add explanations to the rows, and write the images of --explain-dir.
+        """Add explanations to the rows, write images on request, and return a function that prints the explanations.
 
-        The explanation is None for a prompt that selects nothing. Return a function that prints the explanations.
+        The explanation is None for a prompt that selects nothing.
         """
         import torch  # noqa: PLC0415
 
@@ -576,9 +576,9 @@ def print_answer(
 
 
 def _is_loose(row: dict[str, Any], threshold: float) -> bool:
-    """Return True if a prompt selects at least twice as many Gaussians as at its suggested threshold.
+    """Return True if a prompt selects at least twice as many Gaussians as it would at its suggested threshold.
 
-    The numbers are estimated from the histogram of the prompt.
+    Both counts are estimated from the histogram of the prompt.
     """
     if row["histogram"] is None:
         return False
