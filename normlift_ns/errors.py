@@ -80,7 +80,7 @@ _MAX_SUMMARY = 300
 
 
 def truncate_text(text: str, max_length: int = 40) -> str:
-    """Cut a text to at most `max_length` characters, with an ellipsis at the cut.
+    """Shorten text to at most `max_length` characters, with an ellipsis if anything is cut off.
 
     >>> truncate_text("a red bowl", 8)
     'a red b…'

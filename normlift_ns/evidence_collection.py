@@ -46,11 +46,11 @@ if TYPE_CHECKING:
 
 _MAX_CHUNK = 16
 _READERS = 8
-"""Number of images that are read in parallel while one is processed or a network loads."""
+"""Number of images to read ahead in parallel while the current image is processed or a network loads."""
 _MIN_SIDE = 8
 """Minimum side length of a downscaled image, in pixels."""
 _CACHE_VERSION = "normlift_ns.block/6"
-"""Version in every cache key; increase it when evidence changes for the same input."""
+"""Version in every key of the evidence cache; increase it if evidence changes for the same input."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class RasterConfig:
     dtype: torch.dtype
     rasterize_mode: RasterizeMode
     weight_power: int
-    """Exponent of the rasterization weights A_ij, whose powers the evidence sums."""
+    """Exponent of the rasterization weights A_ij in the evidence."""
     clip_planes: tuple[float, float] | None = None
     """Near and far planes of the training, in world units; None for those of splatfacto."""
 
@@ -81,12 +81,12 @@ class RasterConfig:
 
     @property
     def key(self) -> list[Any]:
-        """Part of every cache key, as JSON types."""
+        """Settings in every key of the evidence cache, as JSON types."""
         return [self.rasterize_mode, self.weight_power, str(self.dtype), asdict(self.settings), self.backend]
 
 
 class ViewObservations(NamedTuple):
-    """Evidence of some views, with features and levels of their regions."""
+    """Evidence of one or more views, with the features and levels of their regions."""
 
     evidence: Evidence
     features: Float[Tensor, "s d"]
@@ -94,13 +94,13 @@ class ViewObservations(NamedTuple):
 
     @staticmethod
     def of_block(block: ViewBatch, evidence: Evidence) -> ViewObservations:
-        """Combine the evidence of a block with the features and levels of its regions."""
+        """Combine the evidence of a batch of views with the features and levels of its regions."""
         levels = [region_levels(regions, len(rows)) for regions, rows in zip(block.regions, block.features)]
         return ViewObservations(evidence, torch.cat(block.features), torch.cat(levels))
 
     @staticmethod
     def merge(parts: Iterable[ViewObservations]) -> ViewObservations:
-        """Concatenate several groups of views, in the given order."""
+        """Concatenate the observations of several groups of views, in the given order."""
         evidence, features, level = zip(*parts)
         return ViewObservations(Evidence.merge(*evidence), torch.cat(features), torch.cat(level))
 
@@ -126,7 +126,7 @@ class EvidenceCollection:
     gaussians: GaussianScene
     """Gaussians of the scene, on the device that rasterizes."""
     views: Sequence[int]
-    """Indices of the training views."""
+    """Indices of the training views to lift."""
     missing: Sequence[str]
     """Names of the training images without features."""
     source: FeatureSource
@@ -178,7 +178,7 @@ class EvidenceCollection:
 
 
 def region_levels(regions: Int32[Tensor, "levels c"], count: int) -> Int64[Tensor, " r"]:
-    """Return the first level that contains each of `count` regions; 0 for a region without cells.
+    """Return, for each of `count` regions, the first level that contains it, or 0 if it has no cells.
 
     >>> region_levels(torch.tensor([[0, 0, -1], [1, 2, 2]], dtype=torch.int32), 3).tolist()
     [0, 1, 1]
@@ -194,8 +194,7 @@ class ViewBatch(NamedTuple):
 
     cameras: list[Camera]
     labels: list[Int32[Tensor, "h w"]]
-    """Cell of every pixel; -1 for unlabeled, -2 for masked. On each level, the pixels of a cell share a region.
-    """
+    """Cell of every pixel, -1 if unlabeled, -2 if masked. On each level, the pixels of a cell share a region."""
     regions: list[Int32[Tensor, "levels c"]]
     """Region of every cell on every level; -1 for no region."""
     features: list[Float[Tensor, "r d"]]
@@ -280,7 +279,7 @@ def observe_views(
 
 
 def downscaled_source(source: Any, divisor: int) -> Any:
-    """Return a feature source that also accepts label maps in the image size before downscaling."""
+    """Return a feature source that also accepts label maps that have the size of the images before downscaling."""
     return _replace_in_source(source, LabelFiles | PrecomputedFeatures, divisor=divisor)
 
 
@@ -319,15 +318,15 @@ def batch_evidence(
     on_view: Callable[[], None],
     wait_for_kernels: Callable[[], None] = lambda: None,
 ) -> Evidence:
-    """Return the evidence of the regions in a block, from the evidence of cells.
+    """Return the evidence of the regions of a batch of views, summed over the cells of each region.
 
-    The folder caches the cell evidence of each view. The function reads a view from the cache if `reuse` is True and
-    its Gaussians, camera, labels and rasterization settings are the same. Its regions, its features and the other views
-    of its block may differ.
+    The folder caches the cell evidence of each view. If `reuse` is True, the function reuses the cached evidence of a
+    view with the same Gaussians, camera, labels and rasterization settings. The regions and features of the view, and
+    the other views of the batch, may differ.
 
     Args:
         on_view: Called after every view.
-        wait_for_kernels: Called before views that are not cached are rasterized.
+        wait_for_kernels: Called before rasterization, if any view is not cached.
     """
     keys = evidence_keys(gaussians, block, config)
     cached = find_cached_views(folder, keys) if reuse else {}
@@ -352,13 +351,13 @@ def batch_evidence(
 def cached_batch_evidence(
     gaussians: GaussianScene, block: ViewBatch, folder: Path, config: RasterConfig
 ) -> Evidence | None:
-    """Return the evidence of a block from the cache, or None if a view is missing there."""
+    """Return the evidence of the regions of a batch of views from the cache, or None if the cache lacks a view."""
     cached = find_cached_views(folder, evidence_keys(gaussians, block, config))
     return cells_to_regions(join_cached_views(cached), block) if len(cached) == len(block.cameras) else None
 
 
 def evidence_keys(gaussians: GaussianScene, block: ViewBatch, config: RasterConfig) -> list[str]:
-    """Return the cache key of each view's cell evidence: a digest of everything it depends on."""
+    """Return the cache key of each view's cell evidence, a digest of all inputs of the rasterization."""
     primitive = [] if gaussians.primitive == "3dgs" else [gaussians.primitive]
     scene = _digest(
         [_CACHE_VERSION, *config.key, *primitive],
@@ -372,7 +371,7 @@ def evidence_keys(gaussians: GaussianScene, block: ViewBatch, config: RasterConf
 
 
 def cells_to_regions(evidence: Evidence, block: ViewBatch) -> Evidence:
-    """Convert evidence of the cells of a batch of views to evidence of its regions."""
+    """Convert the evidence of the cells of a batch of views to evidence of their regions."""
     counts = torch.tensor([0, *(len(rows) for rows in block.features)])
     first = counts.cumsum(0).tolist()
     columns = [torch.where(regions >= 0, regions + start, -1) for regions, start in zip(block.regions, first)]
@@ -404,7 +403,7 @@ def check_undistorted(source: FeatureSource, *views: View) -> None:
     """Check that the label map of an undistorted image was not made from the original, distorted image.
 
     Undistortion crops an image by a few pixels, but may move its content by many. A map of a different size may
-    therefore show the distorted image, so the function accepts only maps of exactly the undistorted size.
+    therefore show the distorted image, so the function accepts only maps that have the size of one of the views.
 
     Args:
         views: The same view at every size that the label map may have.
@@ -448,7 +447,7 @@ _VIEWS = "views"
 _CACHED_HEADERS = 2**14
 """Maximum number of file headers that a process keeps in memory."""
 CachedView = tuple[Evidence, int]
-"""Evidence of several views, and the index of one view in it."""
+"""Evidence of one or more views, and the index of one of them."""
 
 
 def cache_views(evidence: Evidence, folder: Path, keys: Sequence[str]) -> None:
@@ -481,13 +480,13 @@ def find_cached_views(folder: Path, keys: Sequence[str]) -> dict[int, CachedView
 
 
 def views_in_cache(folder: Path, keys: Sequence[str]) -> list[bool]:
-    """Return a boolean for each key; it is True if the header of a file in the folder lists the key."""
+    """Return, for each key, True if the header of a file in the folder lists it."""
     listed = {key for keys in _cache_headers(folder).values() for key in keys}
     return [key in listed for key in keys]
 
 
 def join_cached_views(places: Mapping[int, CachedView]) -> Evidence:
-    """Return the evidence of all views in the order of their indices."""
+    """Join the evidence of cached views, in ascending order of the keys of `places`."""
     runs: list[tuple[Evidence, list[int]]] = []
     for number in sorted(places):
         evidence, view = places[number]
@@ -509,9 +508,10 @@ def _cache_path(folder: Path, keys: Sequence[str]) -> Path:
 
 
 def _cached_files(folder: Path, keys: Sequence[str]) -> Iterator[tuple[Path, list[str]]]:
-    """Yield the files that contain any of the views, with the keys of all their views.
+    """Yield the files that contain any of the requested views, with the keys of all views in the file.
 
-    The file with exactly these views comes first. The others follow by decreasing number of these views.
+    A file with exactly the requested views comes first. The others follow by the number of requested views that they
+    contain, largest first.
     """
     exact = _cache_path(folder, keys)
     if exact.is_file():
@@ -534,7 +534,7 @@ def _cache_headers(folder: Path) -> dict[Path, list[str]]:
 
 @lru_cache(_CACHED_HEADERS)
 def _cache_header(path: str, modified: int, size: int) -> str:
-    """Return the view keys in the header of a file, separated by spaces; empty if the file is damaged."""
+    """Return the view keys in the header of a file, separated by spaces; empty if the file is missing or damaged."""
     try:
         return read_metadata(Path(path)).get(_VIEWS, "")
     except (FileNotFoundError, ValueError):

@@ -101,7 +101,7 @@ class TrainedSplat(NamedTuple):
         return TrainedSplat(scene.parameters, scene.has_harmonics, scene.rasterize_mode)
 
     def transformed(self, by: SimilarityTransform) -> TrainedSplat:
-        """Return the Gaussians after a similarity transform, with plain colors as spherical harmonics of degree 0."""
+        """Return the Gaussians after a similarity transform; plain colors become spherical harmonics of degree 0."""
         world = WorldTransform(np.column_stack([by.rotation, by.shift / by.scale]), by.scale)
         return TrainedSplat(transform_splat(self.with_harmonics(), world).parameters, True, self.rasterize_mode)
 
@@ -148,7 +148,7 @@ class WrittenSplat(NamedTuple):
     """Summary of an exported splat."""
 
     rows: Int64[np.ndarray, " m"]
-    """Indices of the Gaussians in the scene, in the order of the file."""
+    """Scene indices of the written Gaussians, in the order of the file."""
     remarks: tuple[str, ...]
     """Messages about rounding errors."""
 
@@ -165,9 +165,9 @@ def write_splat(
     """Write a splat, and next to it <stem>_rows.npy with the scene indices of its Gaussians, in the order of the file.
 
     With an answer or instances, also write the names of classes and objects to <stem>_names.json. With
-    `labels.objects`, also write them to <stem>_objects.json. If a JSON file is not written, `overwrite` deletes that of
-    an earlier export. Uncompressed PLY files and GLB files contain reliabilities, relevancies and labels; the other
-    formats have no columns for them.
+    `labels.objects`, also write this table to <stem>_objects.json. If a JSON file is not written, `overwrite` deletes
+    that of an earlier export. Uncompressed PLY files and GLB files contain reliabilities, relevancies and labels; the
+    other formats have no columns for them.
 
     Args:
         path: Path of the file.
@@ -292,9 +292,10 @@ def _comment(text: str) -> str:
 
 
 def _export_arrays(job: ExportJob, folder: Path) -> list[str]:
-    """Write coord.npy [M, 3] float32, segment.npy and instance.npy [M] int32, and names.json, or no file at all.
+    """Write coord.npy [M, 3] float32, segment.npy and instance.npy [M] int32, and names.json.
 
-    These files number classes and objects from 0, as class_id - 1 and instance_id - 1. Evaluations ignore -1.
+    The files number classes and objects from 0, as class_id - 1 and instance_id - 1. Evaluations ignore -1. If an error
+    occurs, no file is written.
 
     Raises:
         FileExistsError: A file exists, and `overwrite` of the job is False.
@@ -345,7 +346,7 @@ def nearest_gaussians(
         means: Centers of at least one Gaussian.
         max_distance: Maximum distance, inclusive.
     Returns:
-        The row of the nearest center for each point, and True for each point whose nearest center is near enough.
+        The row of the nearest center for each point, and a mask of the points within `max_distance` of that center.
 
     >>> nearest_gaussians(np.array([[0.0, 0, 1], [0, 0, 9]]), np.array([[0.0, 0, 3], [0, 0, 0]]), max_distance=2.0)
     (array([1, 0]), array([ True, False]))
@@ -390,7 +391,7 @@ def read_cloud(path: Path) -> PlyData:
 
 
 def check_no_properties(cloud: PlyData, names: Iterable[str]) -> None:
-    """Raise ValueError if the vertices of a cloud already have properties of these names."""
+    """Raise ValueError if the vertices of a cloud already have a property with one of these names."""
     existing = sorted(set(cloud["vertex"].data.dtype.names or ()) & set(names))
     if len(existing) > 0:
         raise InputError(
@@ -442,7 +443,7 @@ def write_cloud(path: Path, cloud: PlyData, columns: dict[str, np.ndarray], *, o
     All other values, elements and comments stay unchanged.
 
     Raises:
-        ValueError: The vertices already have a property of one of these names.
+        ValueError: The vertices already have a property with one of these names.
         FileExistsError: The file exists, and `overwrite` is False.
         OSError: The file cannot be written.
     """

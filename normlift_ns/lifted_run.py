@@ -112,12 +112,12 @@ class LiftedRun:
 
     @property
     def features(self) -> Float[Tensor, "n d"]:
-        """Unit direction of every Gaussian after the vote, 0 if it has none; computed on every access."""
+        """Unit direction of every Gaussian after the vote, or zeros if it has none; computed on every access."""
         return self.field.directions()
 
     @property
     def scalars(self) -> Scalars:
-        """Reliability, norm, weight and the other numbers of every Gaussian; see `normlift_ns.Scalars`."""
+        """Reliability, norm, weight and other statistics of every Gaussian; see `normlift_ns.Scalars`."""
         return self.field.scalars
 
     @property
@@ -169,7 +169,7 @@ class LiftedRun:
             refined: Use the directions after the vote.
         Raises:
             ValueError: No prompt is given, a prompt is empty, the encoder cannot encode a prompt, or an option is
-                invalid. Also if a vector has another number of values than the features, is zero or is not finite.
+                invalid. Also if a vector differs in length from the features, is zero or is not finite.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -198,7 +198,7 @@ class LiftedRun:
         return run_query(self.field, self.scene.gaussians.means, question)
 
     def _checked(self, name: str, vector: Float[Tensor, " d"]) -> Float64[np.ndarray, " d"]:
-        """Return the vector of a prompt as a NumPy array."""
+        """Check the vector of a prompt, and return it as a NumPy array."""
         row = vector.detach().double().cpu().numpy()
         if row.shape != (self.field.dimension,):
             raise InputError(
@@ -221,7 +221,7 @@ class LiftedRun:
         ns-render and ns-viewer then show the relevancy of its prompts.
 
         Raises:
-            ValueError: The query is not valid, or its vectors have another number of values than the features.
+            ValueError: The query is not valid, or its vectors differ in length from the features.
             FileNotFoundError: The run was moved or deleted.
         """
         question = question.question if isinstance(question, Answer) else question
@@ -251,22 +251,22 @@ class LiftedRun:
         labels, and the names of its classes and objects are written to <stem>_names.json.
 
         Args:
-            path: File to write. Names that end with .glb, .spz or .compressed.ply select these formats, and all other
-                names select PLY.
+            path: File to write. The endings .glb, .spz and .compressed.ply select the format. Other endings select PLY,
+                except .splat, .sog, .ksplat and .gltf, which are not supported.
             part: Answer or finding that selects the Gaussians, or a mask of Gaussians. If None, write the whole scene.
             answer: Answer that provides relevancies, class_id and instance_id. If None, use the answer of `part`, if
                 there is one.
             objects: Table to write to <stem>_objects.json, with JSON types only.
             object_max_gap: Maximum gap between Gaussians of one object, as in `find_objects`.
             object_min_gaussians: Minimum number of Gaussians in an object, as in `find_objects`.
-            overwrite: Replace files of these names, and remove an earlier <stem>_names.json or <stem>_objects.json that
-                this export does not write.
+            overwrite: Replace existing files, and remove an earlier <stem>_names.json or <stem>_objects.json that this
+                export does not write.
         Returns:
             The row indices of the written Gaussians, in the order of the file.
         Raises:
             FileExistsError: A file exists and `overwrite` is False.
-            ValueError: No Gaussian of `part` is visible, or the mask has the wrong type or length. Also if the name is
-                reserved for files of a run, or the options of objects are given without an answer.
+            ValueError: No Gaussian of `part` is visible, or the mask has the wrong type or length. Also if the export
+                would replace an input or a file of a run, or the options of objects are given without an answer.
         """
         path = check_path("path", path)
         if path.name in ("", ".."):
@@ -309,7 +309,7 @@ class LiftedRun:
             folder: Folder to write to.
             part: Answer or finding that selects the Gaussians, or a mask of Gaussians.
             rest: Invert the masks. Empty pixels are then 255.
-            overwrite: Replace files of these names.
+            overwrite: Replace existing files of the same names.
         Raises:
             FileExistsError: A file exists and `overwrite` is False.
             ValueError: The mask has the wrong type or length.
@@ -347,12 +347,12 @@ class LiftedRun:
                 spacing of the Gaussians.
             coordinates: Coordinate system of the cloud. "capture" is that of the original cameras, before the training
                 rotated and scaled them, and "scene" is that of the Gaussians.
-            overwrite: Replace a file of that name.
+            overwrite: Replace an existing file.
         Raises:
             FileNotFoundError: The cloud does not exist, or the run has no dataparser_transforms.json for "capture".
             FileExistsError: A file exists and `overwrite` is False.
-            ValueError: `part` has no answer, the cloud is not a PLY file or already has properties of these names, or
-                the distance is not positive.
+            ValueError: `part` has no answer, the cloud is not a PLY file or already has properties with the names of
+                labels, or the distance is not positive.
 
         >>> from normlift_ns import open_run
         >>> run = open_run(config)
@@ -378,7 +378,7 @@ class LiftedRun:
 
     @cached_property
     def votes(self) -> RecordedVotes:
-        """Evidence of the lift for each training image.
+        """Votes of the images that were lifted.
 
         `votes.pictures(why.views[:3])` yields the three images with the largest weight, with outlines of the regions
         that voted.
@@ -415,8 +415,8 @@ class LiftedRun:
     ) -> Catalogue:
         """List the objects of a selection, in the coordinates of the capture and in those of the scene.
 
-        Each object has a number, size, oriented box, centroid, extent, reliability R and the images that show it.
-        docs/objects.md explains every value.
+        Each object has a number, a size, an oriented box, a centroid, an extent, a reliability R, the number of images
+        that show it, and the names of up to three of them. docs/objects.md explains every value.
 
         Args:
             part: Answer or finding that selects the Gaussians, or a mask of Gaussians. Objects of a mask have no text.
@@ -534,8 +534,8 @@ class LiftedRun:
         Args:
             view: Index or name of the image. The folder and the suffix may be omitted.
         Raises:
-            ValueError: Several images have this name, or no image has it. The error for no image is also a KeyError and
-                an IndexError.
+            ValueError: Several images have this name, or no image has this name or index. The error for a missing image
+                is also a KeyError and an IndexError.
         """
         cameras, names = self.scene.train.cameras, self.scene.train.names
         if not isinstance(view, str | Path):
@@ -579,7 +579,7 @@ class LiftedRun:
 
     @check_arguments
     def image(self, view: str | Path | int | Camera, found: Answer | Finding | None = None) -> Image.Image:
-        """Return `render` as a PIL image, with methods such as `save` and `show`.
+        """Render the scene as `render` does, and return a PIL image.
 
         Args:
             view, found: As in `render`.
@@ -651,11 +651,12 @@ def write_run(
     """Write a lifted run, completely or not at all, and return its directory.
 
     The directory contains config.yml (method normlift), nerfstudio_models/step-*.ckpt (step and tensors of the model,
-    without optimizers), dataparser_transforms.json, and the field in normlift/. A run without a nerfstudio source run
-    also has its cameras in transforms.json, and the other settings that reopen it in splat.json.
+    without optimizers), dataparser_transforms.json, and the field in normlift/. For a splat without a nerfstudio
+    run, it also contains the cameras in transforms.json, and the other settings needed to open the run in splat.json.
 
-    Relative paths in the config of the source run stay relative. nerfstudio's own commands must therefore run in the
-    directory in which the source run was trained. The ns-normlift commands run in any directory.
+    Relative paths in the config of the source run stay relative, so nerfstudio's own commands must run in the directory
+    in which the source run was trained. The path of the dataset becomes absolute if the dataset was moved or the new
+    run is outside that directory. The ns-normlift commands run in any directory.
 
     Args:
         run_dir: Directory from `run_directory`, output_dir/experiment/normlift/timestamp.

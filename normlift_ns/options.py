@@ -30,11 +30,11 @@ from normlift_ns.registry import installed_names
 _MAX_INT, _MAX_FLOAT = 2**31 - 1, 1e30
 """Default upper bounds of integer and float options. They prevent overflow in int32 and float32."""
 _MIN_DIVISOR = 1e-6
-"""Lower bound of most positive options, because some of them are used as divisors."""
+"""Lower bound of most positive options, because some of these options are divisors."""
 MAX_PROMPT_LENGTH = 10_000
 """Maximum number of characters in a prompt. CLIP encodes only about the first 70 words."""
 _INVALID = re.compile("[\0\ud800-\udfff]")
-"""Characters that prompts and text options cannot have: NUL, and surrogates, which UTF-8 cannot encode."""
+"""Characters that prompts and text options must not contain: NUL, and surrogates, which UTF-8 cannot encode."""
 _IMPOSSIBLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR)
 """Error numbers for a name that is too long, a loop of links, and a file that is used as a folder."""
 _hints = cache(get_type_hints)
@@ -196,7 +196,7 @@ def new_names(options: Any, stored: Mapping[str, Any]) -> dict[str, Any]:
 def names_of_0_2(options: Any) -> dict[str, Any]:
     """Return options as a dictionary with the names of version 0.2.
 
-    Keys of batches and the encoder entry of manifests still use these names.
+    The capture keys of batches and the encoder entry of manifests still use these names.
     """
     old_names = {new: old for old, new in getattr(options, "old_names", {}).items()}
     values = {old_names.get(field.name, field.name): getattr(options, field.name) for field in fields(options)}
@@ -219,7 +219,7 @@ def renamed_flags(options: Any, prefix: str = "--") -> dict[str, str]:
 
 
 def rename_flags(words: Sequence[str], flags: Mapping[str, str]) -> list[str]:
-    """Replace old flags in a command line by new ones, and print one line per old flag on standard error.
+    """Replace old flags in a command line with new ones, and print one line per old flag on standard error.
 
     Args:
         words: Command line. Words after "--" belong to another command and stay unchanged.
@@ -284,7 +284,7 @@ def check_number(name: str, value: Any, kind: type[int] | type[float] = float) -
 
 
 def check_bool(name: str, value: object) -> None:
-    """Raise InputError unless the value is True or False. Strings raise too, because even "False" is truthy."""
+    """Raise InputError unless the value is True or False. Strings are not converted, because even "False" is truthy."""
     if not isinstance(value, bool):
         raise _error(name, "True or False", value)
 
@@ -471,9 +471,9 @@ CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 BACKGROUND_WORDS = ("floor", "wall", "ceiling", "background", "object", "things", "stuff", "texture")
 """Background prompts of the LERF-OVS protocol (section "Mask thresholding" of the paper)."""
 VoteKind = Literal["paper", "posterior"]
+"""Kind of vote among neighboring Gaussians; see `RefineConfig`."""
 ReliabilityKind = Literal["paper", "pairs", "angular"]
-"""Kind of reliability to store; see `LiftOptions`. The kind of vote, `VoteKind`, is explained in
-`normlift_ns.refine`."""
+"""Kind of reliability to store; see `LiftOptions`."""
 WithoutDirection = Literal["none", "first"]
 """Class that an evaluation assigns to Gaussians without a direction: no class, or the first class."""
 OBJECT_MAX_GAP, OBJECT_MIN_GAUSSIANS = 4.0, 20

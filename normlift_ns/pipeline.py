@@ -99,7 +99,7 @@ _OBJECT_REGIONS = ("sam", "sam2", "sam3", "edges", "langsplat")
 _COMPARED = 20_000
 """Approximate number of Gaussians whose directions are compared before and after the vote."""
 _ALIGNMENT_FOLDER = "alignment"
-"""Folder of the cache with comparisons of renders and images."""
+"""Subfolder of the cache for comparisons of renders with images."""
 _WARM_UP_GAUSSIANS, _WARM_UP_REGIONS = 4096, 4
 
 
@@ -143,8 +143,8 @@ def lift_run(
         output_dir: Output folder, instead of the outputs folder of the trained run.
         timestamp: Name of the new run directory. If None, use the current time, with a number if such a run exists.
         overwrite: Replace an existing run directory of that name. For exported files, see `FeatureExport.overwrite`.
-        check_alignment: Compare a few training images with renders of the scene before the lift. Warn if they differ,
-            and raise if they do not show the same scene.
+        check_alignment: Compare a few training images with renders of the scene before the lift. Warn if they differ.
+            Raise if they show almost no Gaussians or, for a splat without a nerfstudio run, another scene.
         device: Device to lift on: auto, cpu or cuda.
         export: Destination of a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: Progress callback, called with (stage, steps done, total steps).
@@ -252,7 +252,7 @@ def run_lift(request: LiftRequest) -> LiftedRun:
 
 
 def prepare_lift(request: LiftRequest) -> PreparedLift:
-    """Load encoders, open the scene and choose the run directory, without writing to this directory."""
+    """Make the feature source, open the scene, and choose the run directory without writing to it."""
     device, options = choose_device(request.device), (request.source or SourceOptions()).looking_for(request.queries)
     init_cuda(device)
     source = None
@@ -285,7 +285,7 @@ def prepare_lift(request: LiftRequest) -> PreparedLift:
 
 
 def load_networks(source: FeatureSource, cache: Path) -> None:
-    """Start to load the networks of a first lift, whose cache folder is empty, in a background thread.
+    """Start to load the networks of a lift in a background thread, unless the cache already has features.
 
     Errors are ignored here. They occur again at the first use of the networks.
     """
@@ -296,7 +296,7 @@ def load_networks(source: FeatureSource, cache: Path) -> None:
 
 
 def _start_in_background(*calls: Callable[[], object]) -> None:
-    """Start a thread that runs some calls one after the other, and ignores their errors."""
+    """Start a thread that calls functions one after the other, and ignores their errors."""
 
     def run() -> None:
         for call in calls:
@@ -330,7 +330,7 @@ def announce(prepared: PreparedLift) -> None:
 def compare_with_images(
     scene: Scene, options: LiftOptions, device: str, measure: Callable[..., Alignment] = measure_alignment
 ) -> str | None:
-    """Compare renders with training images; return a warning if they differ, or raise if they show different scenes.
+    """Compare renders with training images; return a warning if they differ, or raise as `alignment_warning` does.
 
     Args:
         measure: Function that measures the agreement.
@@ -414,7 +414,7 @@ class LiftResult(NamedTuple):
     field: SemanticField
     seconds: dict[str, float]
     """Duration of each stage, in order: features, evidence, consensus, recognition, lift, neighbors, vote, store.
-    Stages that the options disable are left out."""
+    Stages that the options disable are left out. A lift in several processes also has exchange, after evidence."""
 
 
 def lift_scene(
@@ -433,7 +433,7 @@ def lift_scene(
     Args:
         cache: Folder for 2D features and evidence. It is created if missing, and may be deleted at any time.
         device: Device for rasterizing, lifting and voting.
-        encoder: Options that queries need to encode prompts in the same way. The manifest stores them.
+        encoder: Options of the text encoder that matches the features. The manifest stores them for queries.
         export: Destination of a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: Progress callback; see `ProgressCallback`.
     Raises:
@@ -497,7 +497,7 @@ def lift_collection(
 
 
 def add_null_level(field: SemanticField, collection: EvidenceCollection, encoder: Mapping[str, Any]) -> SemanticField:
-    """Add the null level of the encoder's null vocabulary to a field; return the field unchanged if there is none."""
+    """Add null levels to a field as in `with_null_level`; return it unchanged if `null_vectors` returns None."""
     reused = collection.cache / "null_words" if collection.options.reuse_evidence else None
     vectors = null_vectors(collection.source, encoder, reused)
     return field if vectors is None else with_null_level(field, vectors)
@@ -541,7 +541,7 @@ def resolve_gsplat_version(scene: Scene, options: LiftOptions) -> str:
 
 
 def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOptions) -> RasterConfig:
-    """Choose rasterization rules, backend and precision. If none fit, raise before any image is read."""
+    """Choose rasterization rules, backend and precision; raise if the backend does not support the lift."""
     rules, mode = resolve_gsplat_version(scene, options), scene.rasterize_mode
     dtype = torch.float64 if options.precision == "double" else torch.float32
     planes = scene.identity.get("clip_planes")
@@ -552,7 +552,8 @@ def choose_raster_config(scene: Scene, gaussians: GaussianScene, options: LiftOp
 def min_agreement(options: LiftOptions, features: Mapping[str, Any] = MappingProxyType({})) -> float:
     """Return the agreement up to which the consensus leaves features unchanged.
 
-    Masks of objects agree by more than chance even if they are damaged. Cells of a partition may agree only by chance.
+    Masks of objects agree more than by chance even if they are inaccurate. Cells of a partition may agree only by
+    chance.
 
     Args:
         features: Identity of the source of 2D features, as in the manifest.
@@ -744,7 +745,7 @@ def count_changes(
 ) -> Int64[Tensor, " 2"]:
     """Return the number of sampled Gaussians that change direction, and the number of all sampled Gaussians.
 
-    The direction changes if the cosine between old and new direction is below `CHANGED_COSINE`.
+    A direction counts as changed if the cosine of the old and the new direction is below `CHANGED_COSINE`.
 
     Args:
         source: Row in the lift of the Gaussian that provides the direction, for each of the first m Gaussians.
@@ -765,7 +766,7 @@ def count_votes(
 
 
 def vote_shares(counts: Int64[Tensor, " 2"], changed: Int64[Tensor, " 2"], n: int) -> dict[str, float]:
-    """Return the counts from `count_votes` and `count_changes` as shares of n Gaussians, for the manifest."""
+    """Return shares for the manifest: `count_votes` relative to n Gaussians, `count_changes` relative to the sample."""
     (copied, lost), (turned, sampled) = counts.tolist(), changed.tolist()
     shares = {"refined_share": copied / n, "changed_share": turned / max(1, sampled)}
     return {**shares, "unsupported_share": lost / n}
@@ -894,7 +895,7 @@ class KernelWarmUp:
 def start_kernel_warm_up(
     scene: Scene, gaussians: GaussianScene, options: LiftOptions, config: RasterConfig
 ) -> KernelWarmUp:
-    """Start to compile or load the kernels of a lift in the background, except those of `start_rasterization`."""
+    """Start to compile or load the kernels of a lift, except those of `start_rasterization` and `start_lift`."""
     if config.backend == "numba":
         from normlift_ns.rasterization.numba import compile_kernels  # noqa: PLC0415 (importing numba takes a second)
 
@@ -911,10 +912,10 @@ def start_kernel_warm_up(
 def lift_calls(
     means: Float[Tensor, "n 3"], options: LiftOptions
 ) -> tuple[list[Callable[[], None]], Callable[[int], list[Callable[[], None]]]]:
-    """Return calls that run stages of a lift on some Gaussians and discard the results, to compile their kernels.
+    """Return functions that run stages of a lift on some Gaussians, to compile the kernels, and discard the results.
 
     Returns:
-        Calls for the consensus and the neighbors, and a function that returns the calls for the lift and the vote,
+        Functions for the consensus and the neighbors, and a function that returns those for the lift and the vote,
         given the dimension of the features.
     """
     means, regions = means[:_WARM_UP_GAUSSIANS], _WARM_UP_REGIONS

@@ -47,7 +47,7 @@ from normlift_ns.segmentation.registry import resolve_source
 
 
 _EVIDENCE_COPIES = 3
-"""Number of copies of the evidence in memory while the parts of all blocks are joined and converted to regions."""
+"""Number of copies of the evidence in memory while the evidence of all batches is joined and converted to regions."""
 _DIRECTION_COPIES = 2
 """Number of copies of the directions in memory while the vote gathers them and a storage format is chosen."""
 _OFFSET_BYTES = 16
@@ -91,7 +91,7 @@ class Measurements:
     preparation_s: Mapping[str, float]
     """Seconds of the steps before the views, by name (start, open, kernels, check). The lift repeats these steps."""
     load_s: float
-    """Seconds to load the network."""
+    """Seconds to load the networks."""
     features_s: float | None
     """Seconds per view with new features; None if all are cached."""
     cached_features_s: float | None
@@ -119,12 +119,12 @@ class Measurements:
     device_bytes: int | None
     """Peak GPU memory up to the end of the evidence stage, in bytes; None without a GPU."""
     measured_views: int = 0
-    """Number of measured views."""
+    """Number of views that the measurement processed."""
 
 
 @dataclass(frozen=True)
 class PlannedStage:
-    """Planned stage of a lift."""
+    """Stage of a planned lift, with its estimated time."""
 
     name: str
     seconds: float
@@ -217,7 +217,7 @@ def make_plan(facts: Measurements, *, num_devices: int = 1) -> Plan:
 
 
 def _share_of(views: int, share: float) -> int:
-    """Round a share of two or more views to a number, which is 0 only for share 0 and `views` only for share 1.
+    """Convert a share of two or more views to a number, which is 0 only for share 0 and `views` only for share 1.
 
     >>> _share_of(45, 0.999), _share_of(45, 1.0), _share_of(45, 0.0)
     (44, 45, 0)
@@ -235,13 +235,13 @@ def _cached(cached: int, views: int) -> str:
 
 
 Clock = Callable[[], float]
-"""Clock that returns seconds."""
+"""Function that returns the current time in seconds."""
 _LARGE_SAMPLE = {"cpu": 2**13, "cuda": 2**18}
 """Number of Gaussians in the larger sample, by device."""
 _SAMPLE_RATIO = 4
 """Size of the larger sample divided by that of the smaller one."""
 _MAX_SAMPLE_VIEWS = 64
-"""Maximum number of views in the samples. The cost of further views is extrapolated."""
+"""Approximate maximum number of views in the samples. The cost of further views is extrapolated."""
 
 
 def measure_core(
@@ -306,7 +306,7 @@ def measure_core(
 
 
 def _rate(small: tuple[float, float], large: tuple[float, float], count: float) -> Rate:
-    """Fit a line to two pairs (items, cost). It passes through the larger pair; slope and fixed part are >= 0."""
+    """Fit a line to two pairs (items, cost). The line passes through `large`; slope and fixed part are >= 0."""
     (items, cost), (more, most) = small, large
     each = (most - cost) / (more - items) if more > items else most / max(1.0, more)
     each = min(max(each, 0.0), most / max(1.0, more))
@@ -331,7 +331,7 @@ _PROJECTED_GAUSSIANS = 100_000
 _FEW_IN_VIEW, _NONE_IN_VIEW = 0.5, 0.001
 """Shares of Gaussians in view below which the check warns, and below which it fails."""
 _HIGH_SHARE = 0.8
-"""An estimate gets a warning if it takes more than this share of the free memory or disk space."""
+"""Share of the free memory or disk space above which an estimate gets a warning."""
 _LIFT_LESS = "increase --lift-downscale, reduce --max-views"
 _SHOWN_PACKAGES = ("torch", "numpy", "nerfstudio", "gsplat", "open_clip_torch")
 
@@ -388,7 +388,7 @@ def describe_recognition(facts: Mapping[str, Any]) -> str:
 def diagnose_recognition(run_dirs: Iterable[Path]) -> list[Diagnostic]:
     """Report how well the first lifted run in the given folders recognizes regions of left-out views.
 
-    The numbers are those of its manifest. If no folder contains a lifted run, return an empty list.
+    The numbers come from its manifest. If no folder contains a lifted run, return an empty list.
 
     Args:
         run_dirs: Folders that may contain a lifted run.
@@ -485,7 +485,7 @@ def diagnose_weights(missing: Sequence[str], options: SourceOptions, device: str
 
 
 def diagnose_memory(plan: Plan, device: str) -> list[Diagnostic]:
-    """Check that the lift fits into memory."""
+    """Check that the lift fits into memory and, on a GPU, into GPU memory."""
     rows = []
     free = min(free_memory().values(), default=None)
     if free is not None:
@@ -533,14 +533,14 @@ _MAX_LOOKUPS = 16
 
 
 class _Observed(NamedTuple):
-    """Observed views, with the seconds of the observation."""
+    """Batch of views, with the seconds to compute its labels and features."""
 
     block: evidence_collection.ViewBatch
     seconds: float
 
 
 def time_kernel_loading(scene: Scene, options: LiftOptions, *, device: str = "cpu") -> float:
-    """Load or compile the kernels of a lift; return an estimate of the seconds that the next process needs for this."""
+    """Load or compile the kernels of a lift, and estimate the seconds that another process needs to load them."""
     gaussians = scene.gaussians.to(device)
     config = pipeline.choose_raster_config(scene, gaussians, options)
     kernels = pipeline.start_kernel_warm_up(scene, gaussians, options, config)
@@ -648,7 +648,7 @@ def _per_view(observed: _Observed) -> float | None:
 def _observe_loaded(
     indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed], batch: int
 ) -> tuple[_Observed, float]:
-    """Observe views; return them with the seconds that loaded networks need, and the seconds to load networks."""
+    """Observe views; return them with the seconds needed once networks are loaded, and the seconds to load networks."""
     if len(indices) == 0:
         return _Observed(evidence_collection.ViewBatch([], [], [], []), 0.0), 0.0
     first = observe(indices[:1])
@@ -661,7 +661,7 @@ def _observe_loaded(
 
 
 def _joined(blocks: Sequence[evidence_collection.ViewBatch], most: int | None = None) -> evidence_collection.ViewBatch:
-    """Join the views of all blocks, up to `most` views."""
+    """Join batches of views, up to `most` views in total."""
     parts = zip(evidence_collection.ViewBatch([], [], [], []), *blocks)
     return evidence_collection.ViewBatch(*(list(islice(chain.from_iterable(cast(Any, part)), most)) for part in parts))
 
@@ -669,7 +669,7 @@ def _joined(blocks: Sequence[evidence_collection.ViewBatch], most: int | None = 
 def _evidence_cached(
     collection: evidence_collection.EvidenceCollection, groups: Sequence[tuple[evidence_collection.ViewBatch, int]]
 ) -> float:
-    """Return the share of views whose evidence is cached.
+    """Estimate the share of the views whose evidence is cached.
 
     Args:
         groups: Batches of sample views, each with the number of views that it represents.

@@ -23,7 +23,7 @@ class StageTimer:
     def __init__(self, report: ProgressCallback, clock: Callable[[], float] = time.perf_counter) -> None:
         self.seconds: dict[str, float] = {}
         self.report = report
-        """Progress callback for stages that count their own steps."""
+        """Progress callback. Stages that count their own steps call it directly."""
         self._clock = clock
         self._done: dict[str, int] = {}
 

@@ -86,7 +86,7 @@ def installed_names(group: str) -> list[str]:
 def _entry_points(group: str, path: tuple[str, ...]) -> Sequence[EntryPoint]:
     """Return the entry points of a group from all packages on an import path; skip packages with damaged metadata.
 
-    The result is cached, because a search through hundreds of packages takes 20 ms, and commands need it often.
+    The result is cached, because a search through hundreds of packages takes 20 ms, and commands need the result often.
     """
     points: list[EntryPoint] = []
     names: set[str] = set()

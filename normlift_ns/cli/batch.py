@@ -47,7 +47,7 @@ _KEY_LENGTH = 16
 
 @dataclass(frozen=True)
 class Capture:
-    """Capture in a capture list."""
+    """Entry of a capture list."""
 
     name: str
     """Line of the capture list that defines this capture."""
@@ -60,7 +60,7 @@ class Capture:
 
 
 def read_captures(path: Path, options: Sequence[str]) -> tuple[Capture, ...]:
-    """Read a capture list, in its order.
+    """Read a capture list, and return its captures in order.
 
     Args:
         path: Text file. Each line has the path of a config.yml, a splat file or a gsplat checkpoint. Options of
@@ -137,7 +137,7 @@ def _capture_key(command: NormLift) -> str:
 
 
 def _splat_options_of_0_2(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert options of a splat to their form in capture keys of version 0.2, so that its batches stay valid."""
+    """Convert options of a splat to their form in capture keys of version 0.2, so that old batches stay valid."""
     new = {name: value for name, value in values.items() if name == "primitive" and value is not None}
     if values["world_transform"] is None:
         new["search"] = False
@@ -149,7 +149,7 @@ def _splat_options_of_0_2(values: Mapping[str, Any]) -> dict[str, Any]:
 def _lift_options_of_0_2(values: Mapping[str, Any]) -> dict[str, Any]:
     """Convert options of a lift to their form in capture keys of version 0.2.
 
-    The result includes options that version 0.2 does not have only if they are set.
+    The result leaves out options that version 0.2 does not have, unless they are set and change the lift.
     """
     old = {name: value for name, value in values.items() if name not in ("reliability", "recognition")}
     if old["consensus_least"] is None:
@@ -436,7 +436,7 @@ def lift_captures(
     on_message: Callable[[str], None] = lambda text: None,
     command: Sequence[str] = LIFT_COMMAND,
 ) -> dict[str, Outcome]:
-    """Lift the captures that are neither lifted nor claimed by another worker, and wait until all captures have ended.
+    """Lift the captures that are neither lifted nor claimed by a live worker, and wait until all lifts have ended.
 
     Args:
         captures: Captures of this worker.

@@ -220,7 +220,7 @@ def _output_errors() -> Iterator[None]:
 
 _PLAIN: dict[str, Any] = {"width": 120, "markup": False, "emoji": False, "highlight": False}
 CONSOLE = Console(**_PLAIN)
-"""Console for results on standard output. It prints markup in texts literally."""
+"""Console for results on standard output. It prints markup literally."""
 if CONSOLE.is_terminal:  # tables fit the terminal; pipes and files get the full width
     CONSOLE.width = max(40, min(CONSOLE.width, shutil.get_terminal_size().columns))
 ERROR_CONSOLE = Console(**_PLAIN, stderr=True)
@@ -529,7 +529,7 @@ def _plain_warnings() -> Iterator[None]:
 
 @cache
 def add_help_texts(options: Any, *, nested: bool = False) -> Any:
-    """Return an options dataclass with help texts from its docstrings.
+    """Add help texts from docstrings to an options dataclass, and return the dataclass.
 
     The docstring under each field becomes the help of its flag. The first paragraph of a class docstring becomes the
     help of its group. tyro reads docstrings itself, but keeps the line breaks of the source. Options nested in a group
@@ -553,7 +553,7 @@ def add_help_texts(options: Any, *, nested: bool = False) -> Any:
 
 @cache
 def _class_definitions(module: str) -> dict[str, list[ast.stmt]]:
-    """Return the statements of every class at the top level of a loaded module; none without its source."""
+    """Return the statements of each top-level class of a loaded module, by class name; empty without its source."""
     with suppress(OSError, TypeError):  # TypeError: the module has no file
         tree = ast.parse(inspect.getsource(sys.modules[module]))
         return {node.name: node.body for node in tree.body if isinstance(node, ast.ClassDef)}
@@ -570,5 +570,5 @@ def field_docstrings(options: Any) -> dict[str, str]:
 
 
 def first_paragraph(options: Any) -> str:
-    """Return the first paragraph of a docstring as one line."""
+    """Return the first paragraph of the docstring of a class as one line."""
     return " ".join((options.__doc__ or "").split("\n\n")[0].split())

@@ -118,7 +118,7 @@ class Demo(CheckedOptions):
         return means
 
     def _find_thing(self, config: Path, truth: NDArray[np.bool_]) -> float:
-        """Lift the features of the networks, search for the object, and return the IoU with the ground truth."""
+        """Lift features of the networks, search for the object, list all objects, and return the IoU of the object."""
         CONSOLE.rule("Searching for an object")
         flags = ("--regions", "edges", "--encoder", "imagenet", "--max-views", _THING_VIEWS)
         flags += ("--refine", "False", "--recognition", "False", "--storage", "evidence")

@@ -149,7 +149,7 @@ class NormLiftExport(options.CheckedOptions):
         return answer.mask if self.select == "selection" else ~answer.mask
 
     def _outputs(self) -> dict[str, Path]:
-        """Return the path of every output, keyed by its exporter."""
+        """Return the paths of all outputs, keyed by exporter."""
         name = self.output_filename
         if name in ("", "..") or Path(name).name != name:
             raise InputError(

@@ -43,7 +43,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 
 @contextmanager
 def join_processes(device: str) -> Iterator[TorchCommunicator | None]:
-    """Join the other processes of the lift. Only the first process prints.
+    """Join the process group of a distributed lift, in which only the first process prints.
 
     Args:
         device: Value of --device.
@@ -232,7 +232,7 @@ class NormLift(CheckedOptions):
                 raise InputError(f"--{name.replace('_', '-')} works only with {needed}. {cure}")
 
     def new_run_location(self) -> tuple[str | None, Path | None]:
-        """Return the capture name and output folder for `run_directory`; None if they are not known yet.
+        """Return the capture name and output folder for `run_directory`, each None if it is not known yet.
 
         Raises:
             InputError, OSError: The config is invalid or cannot be read.
@@ -267,9 +267,9 @@ class NormLift(CheckedOptions):
 
 @contextmanager
 def progress_bars() -> Iterator[ProgressCallback]:
-    """Show a progress bar for each stage, or print a line if the output goes to a pipe or a log file.
+    """Yield a callback that shows a progress bar for each stage, or prints a line to a pipe or log file.
 
-    With --quiet, nothing is printed.
+    With --quiet, the callback prints nothing.
     """
     names = {"features": "2D features", "lift": "lift, reliability", "store": "choosing storage"}
     columns = (
@@ -333,8 +333,8 @@ def frequent_switches() -> Iterator[None]:
 def load_drivers(device: str) -> None:
     """Start to initialize CUDA and to load Triton in background threads, while torch is imported.
 
-    Torch would do both later, and hold Python's global lock. Errors are ignored here. They occur again at the first use
-    of the GPU.
+    Otherwise, torch would do both later, and hold Python's global interpreter lock. Errors are ignored here. They occur
+    again at the first use of the GPU.
 
     Args:
         device: Device to lift on: cpu, cuda, cuda:N or auto.

@@ -190,7 +190,7 @@ def refuse_unused(options: Any, names: Iterable[str], needed: str) -> None:
 
 
 def check_unused_options(lift: LiftOptions) -> None:
-    """Raise InputError for options that have no effect together with the other options."""
+    """Raise InputError if an option has no effect in combination with the other options."""
     if not lift.consensus:
         names = ("consensus_power", "consensus_sample", "consensus_min_agreement")
         refuse_unused(lift, names, "--consensus True")
@@ -199,7 +199,7 @@ def check_unused_options(lift: LiftOptions) -> None:
 
 
 def check_source_options(source: SourceOptions, queries: Iterable[str]) -> None:
-    """Check the folders, the weights, the level and the prompts of 2D features."""
+    """Check the options of the 2D features, including their folders, weights and prompts."""
     from normlift_ns.encoders.registry import encoder_kind, with_encoder  # noqa: PLC0415 (not needed for --help)
     from normlift_ns.encoders.weights import is_local_path  # noqa: PLC0415
     from normlift_ns.segmentation.registry import check_mask_options, requested_regions  # noqa: PLC0415

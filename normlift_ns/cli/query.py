@@ -204,7 +204,7 @@ class NormLiftQuery(CheckedOptions):
 
     @cached_property
     def _prompts(self) -> tuple[str, ...]:
-        """Prompts in the texts of --text; see `split_texts`."""
+        """Prompts of --text; see `split_texts`."""
         from normlift_ns.query.question import split_texts  # noqa: PLC0415 (--help should not wait for NumPy)
 
         return split_texts("--text", self.text)
@@ -218,7 +218,7 @@ class NormLiftQuery(CheckedOptions):
 
     @property
     def _votes(self) -> RecordedVotes:
-        """Evidence of the lift for each training image."""
+        """Votes of the images that were lifted."""
         from normlift_ns.analysis.explain import RecordedVotes  # noqa: PLC0415 (as above)
 
         return RecordedVotes(self._run.scene, self._run.field, cache_folder(self._run.folder))
@@ -243,7 +243,7 @@ class NormLiftQuery(CheckedOptions):
         return lambda: save_overlays(scene, result, cameras, folder, **shared)
 
     def _explain(self, result: Answer, rows: list[dict[str, Any]]) -> Callable[[], None]:
-        """Add explanations to the rows, write the images, and return a function that prints the explanations.
+        """Add explanations to the rows, write images on request, and return a function that prints the explanations.
 
         The explanation is None for a prompt that selects nothing.
         """
@@ -261,7 +261,7 @@ class NormLiftQuery(CheckedOptions):
     def _segment(
         self, result: Answer, rows: list[dict[str, Any]], means: np.ndarray
     ) -> tuple[dict[str, Any], Callable[[], None]]:
-        """Segment training views with SAM 3 for the same prompts, lift the masks, and add their summary to every row.
+        """Segment training views with SAM 3 for the prompts, lift the masks, and add a summary to each row.
 
         Args:
             means: Centers of the Gaussians for the summary, [N, 3].
@@ -514,7 +514,7 @@ def answer_lines(run: QuickRun, rules: Mapping[str, Any], lines: Iterable[bytes]
         rules: Keyword arguments of `QuickRun.ask`.
         lines: Prompts in UTF-8. If None, read standard input.
     Raises:
-        ValueError: Standard output is closed, or some prompts failed. The JSON line of each such prompt has the key
+        ValueError: Standard output is closed, or some prompts failed. The JSON line of each failed prompt has the key
             `error`.
     """
     stdin: Any = sys.stdin  # None if it is closed
@@ -557,8 +557,8 @@ def print_answer(
 ) -> None:
     """Print the table of an answer, and notes on some of its prompts.
 
-    Notes are printed for prompts without a clear match, and for prompts that are encoded only in part. They are also
-    printed for prompts that select at least twice as many Gaussians as at the suggested threshold.
+    The notes are about prompts that have no clear match, are encoded only in part, or probably select too much; see
+    `_is_loose`.
     """
     rule = f"{question.rule} > {question.threshold:.4g}"
     narrow = common.CONSOLE.width < 100
@@ -576,9 +576,9 @@ def print_answer(
 
 
 def _is_loose(row: dict[str, Any], threshold: float) -> bool:
-    """Return True if a prompt selects at least twice as many Gaussians as at its suggested threshold.
+    """Return True if a prompt selects at least twice as many Gaussians as it would at its suggested threshold.
 
-    The numbers are estimated from the histogram of the prompt.
+    Both counts are estimated from the histogram of the prompt.
     """
     if row["histogram"] is None:
         return False
@@ -713,7 +713,7 @@ def _votes_to_show(why: Why) -> dict[str, tuple[ViewVote, ...]]:
 def save_vote_images(
     recorded: RecordedVotes, texts: Sequence[str], reasons: Sequence[Why | None], folder: Path, *, overwrite: bool
 ) -> None:
-    """Write the images with the largest weights and disagreements, or no file at all.
+    """Write the images with the largest weight, and others that disagree; if an error occurs, write no file.
 
     The files are <number>_<text>_1_<image>.png … and <number>_<text>_disagrees_1_<image>.png ….
 
@@ -747,7 +747,7 @@ def print_explanations(
         names: Names of all images.
         texts: Prompts.
         reasons: Explanation of each prompt, or None if it selects nothing.
-        folder: Folder of `save_vote_images`; None if there is none.
+        folder: Folder that `save_vote_images` wrote to, if any.
     """
     result = explanation_table(names, texts, reasons, narrow=common.CONSOLE.width < 120)
     if result.row_count > 0:
@@ -787,7 +787,7 @@ def explanation_table(
 
 
 def print_sam3_table(texts: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
-    """Print one row per prompt about the lifted masks of SAM 3."""
+    """Print a table of the lifted masks of SAM 3, with one row per prompt."""
     from normlift_ns.query.sam3_query import MIN_MASK_FRACTION  # noqa: PLC0415 (loads torch)
 
     limit = max(row["min_reliability"] for row in rows)

@@ -37,7 +37,7 @@ class Weights:
     data: str
     """Training data and its terms."""
     origin: str
-    """Package on the Python index, or repository on the Hugging Face hub."""
+    """Package on the Python package index, or repository on the Hugging Face hub."""
     expected: Callable[[], Path]
     """Function that returns the path at which the commands look for the weights."""
     find: Callable[[], Path | None]

@@ -1,6 +1,6 @@
 """Method specifications for nerfstudio's entry points, or None if a method cannot be loaded.
 
-Every ns-* command loads all entry points without a try block. An error in one of them would therefore disable the
+nerfstudio's commands load all entry points without a try block. An error in one of them would therefore disable the
 methods of all packages. Here, it is printed to standard error instead. nerfstudio ignores objects that are not a
 MethodSpecification.
 """
@@ -14,7 +14,7 @@ from typing import Any
 
 
 def _rename_flags(words: list[str]) -> list[str]:
-    """Replace old names of options in the command line of this process, if it is ns-train with a normlift method."""
+    """Replace old option names in a command line of ns-train with a normlift method; leave others unchanged."""
     from normlift_ns.options import LiftOptions, SourceOptions, rename_flags, renamed_flags  # noqa: PLC0415 (may fail)
 
     if Path("".join(words[:1])).stem != "ns-train" or not "".join(words[1:2]).startswith("normlift"):

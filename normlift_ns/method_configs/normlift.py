@@ -1,7 +1,7 @@
 """Methods normlift, normlift-lerf-ovs and normlift-scannet of `ns-train`.
 
-Every ns-* command imports this module while nerfstudio builds its list of methods. It must therefore not import that
-list (nerfstudio.configs.method_configs, nerfstudio.utils.eval_utils), or slow or optional modules.
+nerfstudio's commands import this module while nerfstudio builds its list of methods. The module must therefore not
+import that list (nerfstudio.configs.method_configs, nerfstudio.utils.eval_utils), or slow or optional modules.
 """
 
 from pathlib import Path

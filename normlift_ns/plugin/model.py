@@ -1,4 +1,4 @@
-"""Class names used in config.yml files of version 0.1."""
+"""Old import path of the model classes, in config.yml files of version 0.1."""
 
 from normlift_ns.nerfstudio_plugin.model import NormLiftModel, NormLiftModelConfig
 

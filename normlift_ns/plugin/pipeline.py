@@ -1,4 +1,4 @@
-"""Class names used in config.yml files that `ns-train normlift` of version 0.1 wrote."""
+"""Old import path of the pipeline classes, in config.yml files that `ns-train normlift` of version 0.1 wrote."""
 
 from normlift_ns.nerfstudio_plugin.pipeline import NormLiftPipeline, NormLiftPipelineConfig
 
