@@ -260,7 +260,7 @@ _DELAY = 0.1
 def explanation_of_run(folder: Path | None, field: SemanticField | None = None) -> Explanation:
     """Return an `Explanation` that uses the images of a lifted run.
 
-    The first call of its `compute` opens the run again, with its images.
+    The first call of `Explanation.compute` opens the run again, with its images.
 
     Args:
         folder: Folder of the semantic field, or None if the run is not stored yet.
@@ -294,7 +294,7 @@ def move_camera(client: Any, target: ObjectRow, scene: GaussianScene, drawn: Boo
 def rerender_clients(viewer: Any) -> None:
     """Render the image again in every browser of nerfstudio's viewer.
 
-    `Viewer._trigger_rerender` of nerfstudio 1.1.5 stops at the first browser that is just connecting or disconnecting.
+    `Viewer._trigger_rerender` of nerfstudio 1.1.5 stops at the first browser that is connecting or disconnecting.
     The other browsers would keep outdated images.
     """
     if not viewer.ready:

@@ -51,7 +51,7 @@ class NormLiftPipelineConfig(VanillaPipelineConfig):
 
 
 class NormLiftPipeline(VanillaPipeline):
-    """splatfacto's pipeline, which lifts features onto the last checkpoint of a run when training ends."""
+    """Pipeline for splatfacto that lifts features onto the last checkpoint of a run when training ends."""
 
     config: NormLiftPipelineConfig  # pyrefly: ignore[bad-override-mutable-attribute]
 

@@ -102,7 +102,7 @@ class ServerOptions:
 
 
 class Guard:
-    """ASGI middleware that checks Host and Origin headers, limits body size and duration, and adds security headers."""
+    """ASGI middleware that checks Host and Origin headers, limits request size and time, and adds security headers."""
 
     def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
         self._app, self._names = app, names

@@ -52,7 +52,7 @@ def region_mask(served: ServedRun, state: State, value: protocol.Region | protoc
 
 
 def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[dict[str, Any], tuple[ObjectRow, ...]]:
-    """Return the content of a message of the type "state", and the listed objects.
+    """Return the content of the message "state", and the listed objects.
 
     Args:
         rows: Indices of the Gaussians on the page; see `ServedRun.rows`.

@@ -154,7 +154,7 @@ def features(served: ServedRun, query: Any) -> Content:
     """Return the unit features [M, D] of a range of Gaussians as an NPY file, with zeros for those without a direction.
 
     Raises:
-        ValueError: The range is empty, exceeds the scene, or has more than `MAX_FEATURES` Gaussians.
+        ValueError: The range is empty, extends beyond the scene, or has more than `MAX_FEATURES` Gaussians.
     """
     count = len(served.space)
     start, stop = (int(_number(name, query.get(name, str(end)))) for name, end in (("start", 0), ("stop", count)))

@@ -24,9 +24,10 @@ from normlift_ns.session.state import State
 
 
 ColorMode = Literal["overlay", "heat", "prompts", "reliability", "rgb", "pca"]
-"""Coloring of the scene. overlay: selected Gaussians in the color of their best prompt, stronger for higher relevancy.
-prompts: the same at full strength. heat: relevancy of all Gaussians with a direction, in a colormap. reliability: R in
-a colormap from 0 to 1. rgb: trained colors. pca: three principal components of the features as RGB."""
+"""Coloring of the scene. overlay: selected Gaussians in the color of their most relevant prompt, stronger for higher
+relevancy. prompts: the same at full strength. heat: relevancy of all Gaussians with a direction, in a colormap.
+reliability: R in a colormap from 0 to 1. rgb: trained colors. pca: three principal components of the features as RGB.
+"""
 COLOR_MODES: tuple[ColorMode, ...] = get_args(ColorMode)
 Text = Annotated[str, msgspec.Meta(max_length=4000)]
 Texts = Annotated[list[Text], msgspec.Meta(max_length=64)]

@@ -175,7 +175,7 @@ class ServedRun:
 
     @cached_property
     def examples(self) -> list[str]:
-        """Up to four words of the encoder that are found in different parts of the scene; [] without a vocabulary."""
+        """Up to four words that are found in different parts of the scene; [] if the encoder has no vocabulary."""
         color = encoder_name(self.run.field) == "color"
         words = _BASIC_COLORS if color else tuple(own_words(self.run.field))
         if len(words) == 0:
@@ -324,7 +324,7 @@ class ServedRun:
         return to_jpeg((shown.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
 
     def remember(self, token: str, page: object) -> tuple[PageMemory, str]:
-        """Return the session of a token, and the token to use from now on.
+        """Return the session of a token, or a new one if the token is unknown, and the token to use from now on.
 
         If another open page uses the token, for instance because a tab was duplicated, the new page gets a copy of the
         session and a new token.

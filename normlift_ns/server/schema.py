@@ -54,7 +54,7 @@ class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     prompt: Annotated[int, msgspec.Meta(ge=0)] | None = None
     """Index of the prompt to select by (default: all prompts)."""
     object: Annotated[int, msgspec.Meta(ge=1)] | None = None
-    """Number of an object to select, from the response of /objects to the same question."""
+    """Number of an object to select, from the response of /objects to the same question and prompt."""
     ray: Ray | None = None
     """Ray; the object that it hits is selected."""
     region: Region | None = None
@@ -163,7 +163,7 @@ class ObjectsResult(msgspec.Struct, frozen=True):
     left_out: int
     """Number of objects that are not listed."""
     in_smaller_parts: int
-    """Number of selected Gaussians in components too small to be objects."""
+    """Number of Gaussians in components too small to be objects, counted separately for each prompt."""
 
 
 class SelectResult(msgspec.Struct, frozen=True):
@@ -252,7 +252,8 @@ def select_state(served: ServedRun, selection: Selection) -> State:
     """Return a state with the requested selection.
 
     Raises:
-        ValueError: The selection is not valid, or its object, ray or region contains no Gaussians.
+        ValueError: A prompt cannot be encoded, the object does not exist, the ray or the region selects no Gaussian, or
+            the mask has the wrong size.
     """
     state = State(served.space, color_mode="overlay")
     if selection.question is not None:

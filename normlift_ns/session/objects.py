@@ -132,7 +132,7 @@ _FILL = 0.8
 """Fraction of the image height that an object fills from the position that `viewpoint` returns."""
 _SIGHT_POINTS = 8
 _AZIMUTHS, _ELEVATIONS = (0, 45, -45, 90, -90, 135, -135, 180), (0, 35)
-"""Angles in degrees of the candidate camera positions, around the vertical and above the current height."""
+"""Azimuths and elevations of the candidate camera positions, in degrees relative to the first candidate."""
 
 
 @dataclass(frozen=True)

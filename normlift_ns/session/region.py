@@ -63,7 +63,7 @@ def visible_gaussians(
     """Return the mask of the drawn Gaussians that lie on or in front of the visible surface of a view.
 
     The depth of the surface is the mean depth rendered at the pixel of the Gaussian's center. A Gaussian may lie behind
-    the surface by twice its largest standard deviation, or by 3 % of the surface's depth if that is more.
+    the surface by up to twice its largest standard deviation, or 3 % of the surface's depth if that is more.
 
     Args:
         drawn: Mask of the Gaussians that are drawn.

@@ -162,7 +162,7 @@ class History(Generic[T]):
     """Key of the last step, if successive steps with this key are merged."""
 
     compact: Callable[[T], T] = lambda state: state
-    """Function applied to the current state before it is replaced, for instance `State.without_caches`."""
+    """Function applied to the current state before another becomes current, for instance `State.without_caches`."""
 
     @staticmethod
     def of(state: T, *, lean: Callable[[T], T] = lambda state: state) -> History[T]:
@@ -175,7 +175,7 @@ class History(Generic[T]):
         return self.states[self.index]
 
     def do(self, state: T, *, key: str | None = None) -> History[T]:
-        """Append a new state, make it current, and drop undone states. Return the same history for the current state.
+        """Append a new state, make it current, and drop undone states; do nothing if the state is already current.
 
         Args:
             key: Key to merge successive steps, such as those of a slider drag; None to keep them separate.
@@ -219,7 +219,7 @@ class RequestToken:
 
 @dataclass
 class RequestTokens:
-    """Request tokens of one user. Methods may be called from any thread.
+    """Tokens of the requests of one user; a new request makes earlier ones stale. Any thread may call the methods.
 
     >>> turns = RequestTokens()
     >>> first, second = turns.start("Reading red"), turns.start("Reading blue")

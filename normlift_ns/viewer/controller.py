@@ -171,7 +171,7 @@ class Controller(ABC):
 
     @abstractmethod
     def _clear(self) -> None:
-        """Remove the query and the selection, and reset the settings of queries."""
+        """Remove the query and the selection, and reset the query settings."""
 
     @abstractmethod
     def _download(self, mask: Bool[Tensor, " n"], name: str, client: Any) -> None:

@@ -89,7 +89,7 @@ class ActionWidgets:
         self._values: dict[Action, Any] = {}
 
     def show_state(self, state: State) -> None:
-        """Show a state in the sliders and in the choice of the prompt; show `remove_weak` only with a warning."""
+        """Show a state in the sliders and the prompt dropdown, and show `remove_weak` if there is a warning."""
         texts = () if state.answer is None else state.answer.texts
         options = (ALL_PROMPTS, *(f"{i + 1}: {clip_text(text, 30)}" for i, text in enumerate(texts)))
         if tuple(self.shown.options) != options:
