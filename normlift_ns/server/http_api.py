@@ -68,7 +68,7 @@ class Endpoint:
 
 
 def query(served: ServedRun, request: schema.QueryRequest) -> schema.QueryResult | Content:
-    """Return the answer to a question, with the arrays that the request specifies."""
+    """Return the answer to a question, with its arrays if the request asks for them."""
     result, content = schema.answered(served, request)
     if request.arrays == "none":
         return content

@@ -207,7 +207,7 @@ def show_prompt(state: State, shown: int | None) -> State:
     """Select Gaussians by one prompt of the query, or by all prompts; this replaces a selection made by hand.
 
     Args:
-        shown: Index of the prompt; None for all prompts.
+        shown: Index of the prompt; None for all prompts. An index out of range changes nothing.
     """
     count = 0 if state.query is None else len(state.query.texts)
     if (shown == state.shown and state.prompts_select) or not 0 <= (shown or 0) < count:

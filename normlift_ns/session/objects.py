@@ -129,7 +129,7 @@ Position = tuple[float, float, float]
 _MAX_OCCLUSION = 0.25
 """Maximum mean opacity in front of an object for a clear view of it."""
 _FILL = 0.8
-"""Fraction of the image height that an object fills from the position that `viewpoint` returns."""
+"""Fraction of the image height that an object fills, seen from the position that `viewpoint` returns."""
 _SIGHT_POINTS = 8
 _AZIMUTHS, _ELEVATIONS = (0, 45, -45, 90, -90, 135, -135, 180), (0, 35)
 """Azimuths and elevations of the candidate camera positions, in degrees relative to the first candidate."""
