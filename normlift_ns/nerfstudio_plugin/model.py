@@ -49,7 +49,7 @@ class LazyLpips(torch.nn.Module):
         self._metric: list[torch.nn.Module] = []  # a list keeps the network out of checkpoints
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """Return the LPIPS of images [B, 3, H, W] in 0..1. If it cannot be loaded, return NaN, and warn once."""
+        """Return the LPIPS of images [B, 3, H, W] in 0..1. If the metric cannot be loaded, warn once and return NaN."""
         if self.available and not self._metric:
             from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity  # noqa: PLC0415 (slow)
 
@@ -65,12 +65,13 @@ class LazyLpips(torch.nn.Module):
 
 
 _MIN_FOCAL = 1e-3
-"""Smallest focal length to render, as a multiple of the longer side of the image. The largest multiple is 1,000."""
+"""Minimum focal length of a camera that replaces an invalid one, as a multiple of the longer side of the image. The
+maximum multiple is the inverse, 1,000."""
 
 
 @dataclass
 class NormLiftModelConfig(SplatfactoModelConfig):
-    """Config of splatfacto with a semantic field from ns-normlift."""
+    """Config of splatfacto with a semantic field."""
 
     _target: type = field(default_factory=lambda: NormLiftModel)
     semantics: Path | None = None
@@ -78,10 +79,10 @@ class NormLiftModelConfig(SplatfactoModelConfig):
 
 
 class NormLiftModel(SplatfactoModel):
-    """splatfacto model that loads without LPIPS weights and without CUDA, and renders values of its Gaussians.
+    """splatfacto model that loads without LPIPS weights and without CUDA, and also renders semantic outputs.
 
-    On CUDA, stock splatfacto renders all outputs except these values. On the CPU, splatfacto cannot render, and
-    normlift_ns renders all outputs.
+    On CUDA, stock splatfacto renders all other outputs. On the CPU, splatfacto cannot render, and normlift_ns renders
+    all outputs.
     """
 
     config: NormLiftModelConfig  # type: ignore[assignment]  (narrower than in the base class, as everywhere in nerfstudio)
@@ -130,7 +131,7 @@ class NormLiftModel(SplatfactoModel):
         self.normlift.open(self._field, self.means.detach(), self.config.semantics, question)
 
     def detach(self) -> None:
-        """Remove the field before the Gaussians change."""
+        """Remove the field. Call this method before the Gaussians change."""
         self.config.semantics = self._field = self._display = None
         self.normlift.close()
 
@@ -140,7 +141,7 @@ class NormLiftModel(SplatfactoModel):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Return the stock outputs (rgb, depth, accumulation, background), and those of `render_outputs` for a display.
+        """Return rgb, depth, accumulation and background, and the outputs of `render_outputs` if there is a display.
 
         Args:
             camera: One camera. An invalid camera from nerfstudio's viewer is replaced by a similar valid one.
@@ -195,7 +196,7 @@ class NormLiftModel(SplatfactoModel):
         return GaussianScene(*(part.detach() if rows is None else part.detach()[rows] for part in parts))
 
     def _render_on_cpu(self, view: Camera, values: Tensor, rows: Tensor | None) -> tuple[dict[str, Tensor], Tensor]:
-        """Render the outputs of `SplatfactoModel.get_outputs` in evaluation, and the values [N, C], in one pass."""
+        """Render the outputs of `SplatfactoModel.get_outputs` in eval mode, and the values [N, C], in one pass."""
         scene = self._scene(rows)
         coefficients = torch.cat([self.features_dc[:, None], self.features_rest], dim=1).detach()
         if rows is not None:

@@ -111,7 +111,7 @@ def visible_mask(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, " n"]:
     """Return the mask of Gaussians that are opaque enough to be drawn.
 
     Args:
-        opacities: Logits.
+        opacities: Opacities as logits.
     """
     return opacities.detach()[:, 0] >= MIN_OPACITY_LOGIT
 
@@ -143,7 +143,7 @@ def status_mdx(state: State, message: str, busy: str, drawn: Bool[Tensor, " n"])
 
 
 def prompt_table(state: State) -> str:
-    """Return a table with the color, count and highest relevancy of each prompt, or with its error."""
+    """Return a Markdown table with the color, selection size and highest relevancy, or the error, of each prompt."""
     answer = state.answer
     if len(state.prompts) == 0:
         return ""
@@ -231,7 +231,7 @@ class PanelWidgets(ActionWidgets):
         self.rule.value, self.negatives.value = "auto", negatives
 
     def show_state(self, state: State) -> None:
-        """Show a state in every widget except the text boxes."""
+        """Show a state as in the base class, and in the checkbox for refined features."""
         super().show_state(state)
         if state.query is not None:
             self._set(Action.REFINED, self.refined, state.query.refined)
@@ -260,7 +260,7 @@ _DELAY = 0.1
 def explanation_of_run(folder: Path | None, field: SemanticField | None = None) -> Explanation:
     """Return an `Explanation` that uses the images of a lifted run.
 
-    The first call of its `compute` opens the run again, with its images.
+    The first call of `Explanation.compute` opens the run again, with its images.
 
     Args:
         folder: Folder of the semantic field, or None if the run is not stored yet.
@@ -294,7 +294,7 @@ def move_camera(client: Any, target: ObjectRow, scene: GaussianScene, drawn: Boo
 def rerender_clients(viewer: Any) -> None:
     """Render the image again in every browser of nerfstudio's viewer.
 
-    `Viewer._trigger_rerender` of nerfstudio 1.1.5 stops at the first browser that is just connecting or disconnecting.
+    `Viewer._trigger_rerender` of nerfstudio 1.1.5 stops at the first browser that is connecting or disconnecting.
     The other browsers would keep outdated images.
     """
     if not viewer.ready:
@@ -356,7 +356,7 @@ class SearchPanel(Controller):
     def open(
         self, field: SemanticField, means: Tensor, folder: Path | None = None, question: Query | None = None
     ) -> None:
-        """Enable the panel for a field, and show the answer to a query.
+        """Enable the panel for a field, and show the answer to a query if one is given.
 
         Args:
             folder: Folder of the field, or None if prompts cannot be saved.
@@ -375,7 +375,7 @@ class SearchPanel(Controller):
             self._show(History.of(state, lean=State.without_caches))
 
     def close(self) -> None:
-        """Remove the field before the Gaussians change."""
+        """Disable the panel. Call this method before the Gaussians change."""
         with self._lock:
             self._discard()
             self._detail_turns.cancel()
@@ -467,7 +467,7 @@ class SearchPanel(Controller):
         self.show_message("Click on the scene, or press Cancel or Escape to stop.")
 
     def _on_click(self, action: Action, origin: Tensor, direction: Tensor) -> None:
-        """Search for objects similar to a clicked Gaussian, or select, add or remove the clicked object."""
+        """Search for Gaussians similar to the clicked one, or select, add or remove the clicked object."""
 
         def click() -> None:
             device = self.history.now.space.means.device
@@ -499,7 +499,7 @@ class SearchPanel(Controller):
             self._widgets.replace.visible = visible
 
     def install(self, viewer: Any) -> None:
-        """Add the tab to a viewer."""
+        """Add the panel to a viewer as its first tab."""
 
         def disconnected(client: Any) -> None:
             # in another thread to avoid a deadlock, because viser holds its lock during this call

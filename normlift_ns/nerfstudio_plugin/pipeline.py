@@ -51,7 +51,7 @@ class NormLiftPipelineConfig(VanillaPipelineConfig):
 
 
 class NormLiftPipeline(VanillaPipeline):
-    """splatfacto's pipeline with a lift of the last checkpoint in the same run."""
+    """Pipeline for splatfacto that lifts features onto the last checkpoint of a run when training ends."""
 
     config: NormLiftPipelineConfig  # pyrefly: ignore[bad-override-mutable-attribute]
 

@@ -60,10 +60,10 @@ _HEADER_TIMEOUT, _BODY_TIMEOUT, _KEEP_ALIVE = 10.0, 20.0, 20
 _MAX_DOWNLOADS, _MAX_DOWNLOAD_BYTES = 16, 2**29
 _TRIM_INTERVAL = 2.0
 _IDLE_SECONDS = 1.0
-"""Seconds without a request after which the server computes data in advance."""
+"""Seconds without a request before the server computes data in advance."""
 _QUICK_THREADS = 4
 _THREADS = max(2, torch.get_num_threads() // 2)
-"""Number of threads for queries, and of further threads for slower work. Each thread uses several cores."""
+"""Number of threads for queries, and number of additional threads for slower work. A thread may use several cores."""
 _HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY, "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin",
@@ -102,7 +102,7 @@ class ServerOptions:
 
 
 class Guard:
-    """ASGI middleware that checks Host and Origin headers, limits body size and duration, and adds security headers."""
+    """ASGI middleware that checks Host and Origin headers, limits request size and time, and adds security headers."""
 
     def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
         self._app, self._names = app, names
@@ -150,22 +150,22 @@ class Guard:
 
 
 class _PromptProtocol(H11Protocol):
-    """HTTP protocol that closes connections whose requests do not arrive in time; uvicorn would wait without limit."""
+    """HTTP protocol that closes a connection if request headers do not arrive in time; uvicorn has no such timeout."""
 
     _deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Wait for the first request."""
+        """Start the timeout for the first request."""
         super().connection_made(transport)
         self._watch()
 
     def data_received(self, data: bytes) -> None:
-        """Handle data, and wait for the rest of a request."""
+        """Handle data, and run the timeout until the headers of a request are complete."""
         super().data_received(data)
         self._watch()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop waiting."""
+        """Stop the timeout."""
         self._stop_watching()
         super().connection_lost(exc)
 
@@ -225,7 +225,7 @@ async def _refuse_websocket(scope: Scope, receive: Receive, send: Send, reason: 
 
 
 class WarmServer:
-    """HTTP server of lifted runs, with the web page, its sessions and the HTTP API on one port.
+    """HTTP server for lifted runs, with the web page, its sessions and the HTTP API on one port.
 
     Args:
         runs: Store of the runs.
@@ -417,7 +417,7 @@ class WarmServer:
         For port 0, the operating system chooses a free port.
 
         Raises:
-            InputError: If neither the port nor any of the 99 ports after it is available.
+            InputError: Neither the port nor any of the 99 ports after it is available.
         """
         listener = _bind(self.options.host, self.options.port)
         config = uvicorn.Config(
@@ -460,7 +460,7 @@ def _bind(host: str, port: int) -> socket.socket:
     For port 0, the operating system chooses a free port.
 
     Raises:
-        InputError: If none of these ports is available.
+        InputError: None of these ports is available.
     """
     family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
     for number in [0] if port == 0 else range(port, min(port + 100, 65536)):

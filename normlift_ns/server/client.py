@@ -102,7 +102,7 @@ class RemoteFinding:
 
     @property
     def result(self) -> PromptResult:
-        """Verdict, fraction, centroid, extent, peak, mean reliability, nearest match and histogram."""
+        """Verdict, summary numbers and histogram of the prompt."""
         return self.answer.result.results[self.index]
 
     @property
@@ -189,14 +189,14 @@ class RemoteRun:
         return msgspec.json.decode(self._post("objects", _selection(part)), type=ObjectsResult)
 
     def select(self, part: Part | Selection) -> SelectResult:
-        """Return the number, center and box of the selected Gaussians, for instance for `Selection(ray=…)`."""
+        """Return the number, center and box of the Gaussians in a selection, such as `Selection(ray=…)`."""
         return msgspec.json.decode(self._post("select", _selection(part)), type=SelectResult)
 
     @check_arguments
     def catalogue(self, part: RemoteAnswer | RemoteFinding) -> dict[str, Any]:
         """List the objects that the prompts of an answer select, with oriented boxes, as JSON types.
 
-        A finding stands for all prompts of its answer.
+        For a finding, list the objects of all prompts of its answer.
         """
         return json.loads(self._post("catalog", _selection(part).question))
 
@@ -244,7 +244,7 @@ class RemoteRun:
 
         Args:
             view: Camera, or the name or index of a training image.
-            found: Selection to color (default: trained colors of all Gaussians).
+            found: Selection to show in color (default: all Gaussians, in their trained colors).
             max_size: Maximum longer side of the image in pixels, in 16..2048.
         """
         request: dict[str, Any] = {"max_size": max_size}

@@ -52,11 +52,11 @@ def region_mask(served: ServedRun, state: State, value: protocol.Region | protoc
 
 
 def describe_state(state: State, rows: np.ndarray, *, details: bool) -> tuple[dict[str, Any], tuple[ObjectRow, ...]]:
-    """Return the content of the message `state`, and the listed objects.
+    """Return the content of the message "state", and the listed objects.
 
     Args:
-        rows: Indices of the drawn Gaussians in the scene.
-        details: Include objects and histograms, which takes longer.
+        rows: Indices of the Gaussians on the page; see `ServedRun.rows`.
+        details: Include objects, histograms and the suggested threshold, which takes longer.
     """
     selection, answer, query = state.selection, state.answer, state.query
     content: dict[str, Any] = {
@@ -147,7 +147,7 @@ def describe_hover(
 
 
 def explanation_of(served: ServedRun, state: State) -> dict[str, Any]:
-    """Return the content of the message `explanation`: the images with the largest weight, and others that disagree.
+    """Return the content of the message "explanation": the images with the largest weight, and others that disagree.
 
     Raises:
         ValueError: Nothing is selected, or the votes of the images are no longer in the cache.

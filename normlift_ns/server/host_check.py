@@ -100,7 +100,7 @@ def _plain(text: str) -> str | None:
 
 
 def _is_own_address(name: str) -> bool:
-    """Return True if `name` is an address of this machine, to which a socket can therefore bind."""
+    """Return True if `name` is an IP address of this machine, which a socket can bind to."""
     with contextlib.suppress(OSError, ValueError):
         address = ipaddress.ip_address(name)
         family = socket.AF_INET if address.version == 4 else socket.AF_INET6

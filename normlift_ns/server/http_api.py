@@ -68,7 +68,7 @@ class Endpoint:
 
 
 def query(served: ServedRun, request: schema.QueryRequest) -> schema.QueryResult | Content:
-    """Return the answer to a question, with the arrays that the request specifies."""
+    """Return the answer to a question, with its arrays if the request asks for them."""
     result, content = schema.answered(served, request)
     if request.arrays == "none":
         return content
@@ -132,7 +132,7 @@ def _camera(served: ServedRun, request: schema.RenderRequest) -> Camera:
 
 
 def save(served: ServedRun, request: schema.SaveRequest) -> dict[str, str]:
-    """Store a question in the run."""
+    """Store the prompts of a question in the run."""
     asked = schema.answer(served, request.question).question
     return {"stored": served.save(asked, replaces=request.replace)}
 
@@ -151,10 +151,10 @@ def coverage_of(served: ServedRun, query: Any) -> dict[str, Any]:
 
 
 def features(served: ServedRun, query: Any) -> Content:
-    """Return the unit features [M, D] of a range of Gaussians as an NPY file; Gaussians without a direction have 0.
+    """Return the unit features [M, D] of a range of Gaussians as an NPY file, with zeros for those without a direction.
 
     Raises:
-        ValueError: The range is empty, exceeds the scene, or has more than `MAX_FEATURES` Gaussians.
+        ValueError: The range is empty, extends beyond the scene, or has more than `MAX_FEATURES` Gaussians.
     """
     count = len(served.space)
     start, stop = (int(_number(name, query.get(name, str(end)))) for name, end in (("start", 0), ("stop", count)))

@@ -152,7 +152,7 @@ def make_mcp(server: WarmServer, export_dir: Path | None) -> MCPServer:
     """Return an MCP server for the runs of a server.
 
     Args:
-        export_dir: Folder that the tool export writes to; None to omit this tool. A read-only server omits it too.
+        export_dir: Folder that the tool export writes to. The tool is omitted for None, and on a read-only server.
     """
     mcp = MCPServer("normlift", instructions=_INSTRUCTIONS, version=normlift_ns.__version__, log_level="ERROR")
     tools = Tools(server, export_dir)

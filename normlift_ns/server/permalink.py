@@ -37,7 +37,7 @@ class PageView(msgspec.Struct, frozen=True):
 
     @property
     def is_valid(self) -> bool:
-        """True if `look_at` differs from `position` and the viewing direction is not parallel to `up`."""
+        """True if `look_at` differs from `position`, and `up` is neither zero nor parallel to the viewing direction."""
         ahead = np.subtract(self.look_at, self.position)
         return bool(np.linalg.norm(np.cross(ahead, self.up)) > 0)
 
@@ -52,7 +52,7 @@ class PageView(msgspec.Struct, frozen=True):
 
 
 class Link(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Query and camera of a link."""
+    """Content of a link: a query, a color mode and a camera."""
 
     prompts: str = ""
     clicks: dict[str, Annotated[int, msgspec.Meta(ge=0)]] = {}

@@ -1,6 +1,6 @@
 """Messages between a page and the server: actions and the types of their values, and the colors of a state.
 
-Colors are sent as a palette and one byte per Gaussian of the page: its index in the palette, or `NOT_DRAWN`.
+Colors are sent as a palette and one byte per Gaussian on the page: an index into the palette, or `NOT_DRAWN`.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from normlift_ns.session.state import State
 
 
 ColorMode = Literal["overlay", "heat", "prompts", "reliability", "rgb", "pca"]
-"""Coloring of the scene. overlay: selected Gaussians in the color of their best prompt, stronger for higher relevancy.
-prompts: the same at full strength. heat: relevancy of all Gaussians with a direction, in a colormap. reliability: R in
-a colormap from 0 to 1. rgb: trained colors. pca: three principal components of the features as RGB."""
+"""Coloring of the scene. overlay: selected Gaussians in the color of their most relevant prompt, stronger for higher
+relevancy. prompts: the same at full strength. heat: relevancy of all Gaussians with a direction, in a colormap.
+reliability: R in a colormap from 0 to 1. rgb: trained colors. pca: three principal components of the features as RGB.
+"""
 COLOR_MODES: tuple[ColorMode, ...] = get_args(ColorMode)
 Text = Annotated[str, msgspec.Meta(max_length=4000)]
 Texts = Annotated[list[Text], msgspec.Meta(max_length=64)]
@@ -73,7 +74,7 @@ class Ray(msgspec.Struct, frozen=True):
 
 
 class Pick(Ray, frozen=True):
-    """Click on a Gaussian; the mode "like" searches for all similar Gaussians."""
+    """Ray of a click; the mode "like" searches for all Gaussians similar to the clicked one."""
 
     mode: Literal["select", "add", "remove", "like"] = "select"
 
@@ -199,14 +200,14 @@ def decode(text: str | bytes | msgspec.Raw, kind: Any) -> Any:
 
 
 NOT_DRAWN = 255
-"""Code of Gaussians that the user has hidden. All other codes are indices in the palette."""
+"""Code of Gaussians that the user has hidden. All other codes are indices into the palette."""
 BY_HAND_COLOR: RGB = (1.0, 0.75, 0.1)
 _OWN, _GRAY = 0, 1
 """Codes of the trained color, and of its dimmed gray value."""
 _FIRST, _CODES = 2, 253
 """First code for the colors of a color mode, and the number of codes for these colors."""
 _MIN_SHARE, _FULL_SHARE = 0.45, 0.85
-"""Opacity of a prompt's color over gray, at the threshold and at the best match."""
+"""Opacity of a prompt's color over gray, at the threshold and at the highest relevancy."""
 _MIN_SPAN = 0.05
 _MIN_LUMINANCE = 0.4
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -215,7 +216,7 @@ _PCA_QUANTILES = (0.02, 0.98)
 
 
 class Codes(NamedTuple):
-    """Colors of M Gaussians: a palette, and the code of each Gaussian, which is an index in it or `NOT_DRAWN`."""
+    """Colors of M Gaussians: a palette, and one code per Gaussian, an index into the palette or `NOT_DRAWN`."""
 
     palette: list[tuple[int, int, int, float, int]]
     """Red, green and blue in 0..255, the opacity of this color, and the color under it (0: trained color, 1: gray).
@@ -224,10 +225,10 @@ class Codes(NamedTuple):
 
 
 def make_codes(state: State, rows: np.ndarray, pca: Float[torch.Tensor, "n 3"] | None = None) -> Codes:
-    """Return the colors of the drawn Gaussians.
+    """Return the colors of the Gaussians on the page.
 
     Args:
-        rows: Indices of the drawn Gaussians in the scene.
+        rows: Indices of these Gaussians in the scene; see `ServedRun.rows`.
         pca: Principal components of all Gaussians, in 0..1; needed for the color mode pca.
     """
     table: list[tuple[int, int, int, float, int]] = [(0, 0, 0, 0.0, 0), (0, 0, 0, 0.0, 1)]
@@ -277,7 +278,7 @@ def legend(state: State) -> dict[str, Any] | None:
 def overlay_scale(state: State) -> tuple[float, float]:
     """Return the relevancies that get the weakest and the strongest color.
 
-    The first is the threshold. The second is the best relevancy, at most 1, but at least 0.05 above the threshold.
+    The first is the threshold. The second is the highest relevancy, at most 1, but at least 0.05 above the threshold.
     """
     assert state.answer is not None
     relevancy = _relevancy(state)[state.answer.valid]
@@ -302,7 +303,7 @@ def pca_of(directions: Float[torch.Tensor, "m d"]) -> tuple[Float[torch.Tensor, 
 
 
 def _prompt_codes(state: State, rows: np.ndarray, table: list[Any], *, full: bool) -> np.ndarray:
-    """Append the colors of the prompts to the palette `table`, and return the codes of the drawn Gaussians."""
+    """Append the colors of the prompts to the palette `table`, and return the codes of the Gaussians `rows`."""
     selection = _rows(state.selection, rows)
     answer = state.answer if state.prompts_select else None
     table.append((*_bytes(BY_HAND_COLOR), _FULL_SHARE, 1))

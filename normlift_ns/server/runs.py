@@ -56,7 +56,7 @@ _POSITION_STEP = 2**-14
 _MEMORY_SHARE = 0.5
 """Default fraction of the free memory that open runs may use."""
 _render_lock = threading.Lock()
-"""Lock for rendering, because numba's threads do not support two renders at the same time."""
+"""Lock for rendering, because numba's threading layer does not support two renders at the same time."""
 
 
 T = TypeVar("T")
@@ -64,7 +64,7 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class PageMemory:
-    """Session of one page, which is kept after the page loses its connection."""
+    """Data of the session of one page, kept after the page loses its connection."""
 
     history: History[State]
     line: str = ""
@@ -72,7 +72,7 @@ class PageMemory:
     clicks: dict[str, int] = field(default_factory=dict)
     """Indices of clicked Gaussians, by the prompt texts that stand for the clicks."""
     negatives: tuple[str, ...] | None = None
-    """Negative prompts of the next query; None for those of the encoder."""
+    """Negative prompts of the next query; None for the defaults."""
     rule: str = "auto"
     min_reliability: float = 0.0
     view: PageView | None = None
@@ -94,9 +94,9 @@ class ServedRun:
     run: LiftedRun
     max_gaussians: int
     reading: threading.Lock = field(default_factory=threading.Lock)
-    """Lock for the text encoder, so that no two threads load it."""
+    """Lock for the text encoder, so that only one thread at a time loads or uses it."""
     analyzing: threading.Lock = field(default_factory=threading.Lock)
-    """Lock for votes, floaters and the inventory, which take seconds, so that no two threads compute them."""
+    """Lock for computing votes, floaters and the inventory, each of which takes seconds, in one thread at a time."""
     _memories: OrderedDict[str, PageMemory] = field(default_factory=OrderedDict)
     _results: OrderedDict[bytes, tuple[Any, int]] = field(default_factory=OrderedDict)
     _memory_lock: threading.Lock = field(default_factory=threading.Lock)
@@ -114,7 +114,7 @@ class ServedRun:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Indices of the drawn Gaussians in the scene, in spatial order, which compresses well."""
+        """Indices of the Gaussians that pages draw, in a spatial order that compresses well."""
         gaussians, rows = self.run.scene.gaussians, self.visible.nonzero().squeeze(1)
         if len(rows) > self.max_gaussians:
             largest = gaussians.scales[rows].double().topk(2, dim=1).values.prod(dim=1)
@@ -123,13 +123,13 @@ class ServedRun:
 
     @cached_property
     def drawn_scene(self) -> GaussianScene:
-        """Scene of the drawn Gaussians."""
+        """Scene of the Gaussians in `rows`, on the CPU."""
         whole, rows = self.run.scene.gaussians, torch.from_numpy(self.rows)
         return whole.to("cpu").select(rows)
 
     @cached_property
     def geometry(self) -> tuple[bytes, str]:
-        """The drawn Gaussians as SPZ in the order of `rows`, and the digest of these bytes."""
+        """The Gaussians in `rows` as SPZ, in the same order, and the digest of these bytes."""
         scene, rows = self.run.scene, torch.from_numpy(self.rows)
         values = {name: value.detach().float().cpu()[rows] for name, value in scene.parameters.items()}
         if not scene.has_harmonics:
@@ -143,8 +143,8 @@ class ServedRun:
     def frame(self) -> tuple[list[float], list[float], float]:
         """Mean up direction of the cameras, center of the scene, and radius of the scene.
 
-        The center is the median position of the cameras and the drawn Gaussians. The cube around it whose half side is
-        the radius contains 80 % of them.
+        The center is the median, along each axis, of the positions of the cameras and of a sample of the Gaussians in
+        `rows`. The radius is half the side of the cube around the center that contains 80 % of these positions.
         """
         poses = [camera.world_to_camera.double().cpu().numpy() for camera in self.run.scene.train.cameras]
         up = -np.mean([pose[1, :3] for pose in poses], axis=0) if len(poses) > 0 else np.zeros(3)
@@ -161,7 +161,7 @@ class ServedRun:
 
     @cached_property
     def first_view(self) -> PageView | None:
-        """Camera of the first training image, with a target at the median depth of the scene; None without images."""
+        """Camera of the first training image, with its target at the median depth of the scene; None without images."""
         cameras = self.run.scene.train.cameras
         if len(cameras) == 0:
             return None
@@ -175,7 +175,7 @@ class ServedRun:
 
     @cached_property
     def examples(self) -> list[str]:
-        """Words of the encoder's vocabulary that are found in different parts of the scene; [] without a vocabulary."""
+        """Up to four words that are found in different parts of the scene; [] if the encoder has no vocabulary."""
         color = encoder_name(self.run.field) == "color"
         words = _BASIC_COLORS if color else tuple(own_words(self.run.field))
         if len(words) == 0:
@@ -236,7 +236,7 @@ class ServedRun:
         return {row.text: row.vector for row in prompts_of_query(load_query(self.run.folder / FIELD_FOLDER))}
 
     def known(self, clicks: Mapping[str, int]) -> dict[str, Any]:
-        """Return the vectors of stored prompts and of clicks, which do not need an encoder.
+        """Return the vectors of stored prompts and clicks, by text; they do not need an encoder.
 
         Raises:
             ValueError: A click refers to a Gaussian that this scene does not have.
@@ -259,7 +259,9 @@ class ServedRun:
         return file, content, f"Downloaded {file}. Gaussians: {int(mask.sum()) - faint:,}.{note}"
 
     def cached(self, key: bytes, compute: Callable[[], T], size: Callable[[T], int] = lambda result: 0) -> T:
-        """Return the cached result for a key, and compute it if necessary; the most recently used results are kept.
+        """Return the result for a key from the cache, or compute and cache it.
+
+        Above a limit on their number or total size, the least recently used results are dropped.
 
         Args:
             size: Function that returns the size of a result in bytes.
@@ -307,7 +309,7 @@ class ServedRun:
         return to_jpeg(self.run.scene.train[index].image.cpu().numpy(), max_size)
 
     def still(self, codes: Codes, camera: Camera, background: Sequence[float] = (1.0, 1.0, 1.0)) -> bytes:
-        """Render the drawn Gaussians in the colors of `codes`, as JPEG."""
+        """Render the Gaussians in `rows` in the colors of `codes`, as JPEG."""
         scene, rows = self.run.scene, torch.from_numpy(self.rows)
         kept = torch.from_numpy(codes.codes != NOT_DRAWN)
         own = scene.colors(camera).detach().cpu()[rows][kept].clamp(0, 1)
@@ -322,10 +324,10 @@ class ServedRun:
         return to_jpeg((shown.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
 
     def remember(self, token: str, page: object) -> tuple[PageMemory, str]:
-        """Return the session of a token, and the token to use from now on.
+        """Return the session of a token, or a new one if the token is unknown, and the token to use from now on.
 
-        If another open page uses the token, as after duplicating a tab, the new page gets a copy of the session and a
-        new token.
+        If another open page uses the token, for instance because a tab was duplicated, the new page gets a copy of the
+        session and a new token.
         """
         with self._memory_lock:
             found = self._memories.get(token)
@@ -343,10 +345,10 @@ class ServedRun:
             return found, token
 
     def warm_up(self, wait: Callable[[], None]) -> None:
-        """Compute in advance what `describe` returns, and then the further data that the first page needs.
+        """Compute the geometry and the examples in advance, and then the other data that the first page needs.
 
         Args:
-            wait: Function that returns when there is time for the next part of the further data.
+            wait: Function that blocks until there is time for the next item of the other data.
         """
         _ = self.geometry, self.examples
         for part in (self._compile_renderer, lambda: self.space.neighbor_pairs, lambda: self.pca):
@@ -362,7 +364,7 @@ class ServedRun:
 
     @property
     def in_use(self) -> bool:
-        """True if a page is open."""
+        """True if a page of this run is open."""
         with self._memory_lock:
             return any(memory.page is not None for memory in self._memories.values())
 
@@ -453,7 +455,7 @@ def _estimated_bytes(run: LiftedRun) -> int:
 
 
 def _run_ids(configs: Sequence[Path]) -> list[str]:
-    """Return a short unique id for each config, made of the names of its experiment and time stamp folders."""
+    """Return a short unique id for each config, made of the names of its experiment and timestamp folders."""
     names: list[str] = []
     for config in configs:
         parts = config.absolute().parent.parts

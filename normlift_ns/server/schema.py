@@ -47,16 +47,16 @@ class QueryRequest(Question, frozen=True, forbid_unknown_fields=True):
 
 
 class Selection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Selection of Gaussians by prompts, an object, a ray, a region or a mask. It can also be the likely floaters."""
+    """Selection of Gaussians by prompts, an object, a ray, a region or a mask, or of the likely floaters."""
 
     question: Question | None = None
     """Prompts that select Gaussians; None to select without prompts."""
     prompt: Annotated[int, msgspec.Meta(ge=0)] | None = None
     """Index of the prompt to select by (default: all prompts)."""
     object: Annotated[int, msgspec.Meta(ge=1)] | None = None
-    """Number of an object to select, from the response of /objects to the same question."""
+    """Number of an object to select, from the response of /objects to the same question and prompt."""
     ray: Ray | None = None
-    """Ray that selects the object that it hits."""
+    """Ray; the object that it hits is selected."""
     region: Region | None = None
     """Polygon in an image; the visible Gaussians inside it are selected."""
     floaters: bool = False
@@ -81,7 +81,7 @@ class SelectRequest(Selection, frozen=True, forbid_unknown_fields=True):
 
 
 class SaveRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Question to store in the run."""
+    """Question whose prompts to store in the run."""
 
     question: Question
     replace: bool = True
@@ -92,15 +92,15 @@ class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Request for an image of the scene; the response is a JPEG file."""
 
     view: str | int = 0
-    """Name or index of a training image."""
+    """Name or index of the training image whose camera to use."""
     camera: CameraValue | None = None
-    """Camera, instead of a training image."""
+    """Camera to use instead of that of a training image."""
     page_view: PageView | None = None
-    """Camera by its position and target, instead of a training image."""
+    """Camera as position and target, to use instead of that of a training image."""
     selection: Selection | None = None
     mode: ColorMode = "overlay"
     isolate: bool = False
-    """Draw only the selection, in trained colors whatever the `mode` is."""
+    """Draw only the selection, in trained colors regardless of `mode`."""
     max_size: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 800
 
 
@@ -142,14 +142,14 @@ class QueryResult(msgspec.Struct, frozen=True):
 
 
 class ObjectResult(msgspec.Struct, frozen=True):
-    """Object, a connected component of the selection of a prompt. Positions are in scene units."""
+    """Object of a selection. Positions are in scene units."""
 
     id: int
     text: str
     count: int
     center: list[float]
     min: list[float]
-    """Lower corner of the box that contains 98 % of the centers along each axis; `max` is its upper corner."""
+    """Lower corner of the box around the central 98 % of the centers along each axis; `max` is its upper corner."""
     max: list[float]
     reliability: float
     views: float
@@ -163,7 +163,7 @@ class ObjectsResult(msgspec.Struct, frozen=True):
     left_out: int
     """Number of objects that are not listed."""
     in_smaller_parts: int
-    """Number of selected Gaussians in components too small to be objects."""
+    """Number of Gaussians in components too small to be objects, counted separately for each prompt."""
 
 
 class SelectResult(msgspec.Struct, frozen=True):
@@ -252,7 +252,8 @@ def select_state(served: ServedRun, selection: Selection) -> State:
     """Return a state with the requested selection.
 
     Raises:
-        ValueError: The selection is not valid, or its object, ray or region contains no Gaussians.
+        ValueError: A prompt cannot be encoded, the object does not exist, the ray or the region selects no Gaussian, or
+            the mask has the wrong size.
     """
     state = State(served.space, color_mode="overlay")
     if selection.question is not None:
@@ -315,7 +316,7 @@ def objects_result(state: State) -> ObjectsResult:
 
 
 def extent(state: State, mask: torch.Tensor) -> tuple[list[float], list[float]]:
-    """Return the corners of the box that contains 98 % of the selected centers along each axis."""
+    """Return the corners of the box around the central 98 % of the centers in `mask` along each axis."""
     low, high = np.quantile(state.space.means[mask].double().cpu().numpy(), (0.01, 0.99), axis=0)
     return low.tolist(), high.tolist()
 

@@ -44,8 +44,8 @@ _GREETING_TIMEOUT = 20.0
 _SPOT = 0.3
 """Extent of the region around a position to look at, as a multiple of the scene's radius."""
 _SLIDERS = ("threshold", "reliability", "grow")
-"""Actions of sliders. If several actions of one slider wait in succession, only the last is applied. Successive ones
-are merged into one step of the history."""
+"""Actions of sliders. If successive actions of one slider are waiting, only the last is applied. Successive actions of
+one slider are merged into one step of the history."""
 
 T = TypeVar("T")
 
@@ -358,7 +358,7 @@ class PageSession:
         await self._start("Finding likely floaters …", compute, pending.seq)
 
     async def _start(self, text: str, compute: Callable[[], tuple[Callable[[State], State], str]], seq: int) -> None:
-        """Start a slow request, whose result is a function from the current state to the new one, and a message."""
+        """Start a slow request. `compute` returns a function from the current state to the new one, and a message."""
         token = self._tokens.start(text)
 
         async def work() -> None:
@@ -423,7 +423,7 @@ class PageSession:
         await self._tell(f"The run now stores {count}.", "done", pending.seq)
 
     async def _go_to(self, pending: _Pending) -> None:
-        """Move the camera close to an object or a position, with little occlusion if possible."""
+        """Move the camera to face an object or a position, with little occlusion if possible."""
         value = pending.value
         if value.id is None and value.position is None:
             raise InputError("The action go_to needs a position or the id of an object.")

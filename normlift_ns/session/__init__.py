@@ -1,7 +1,7 @@
 """Viewer-independent session: prompts, selections, hidden Gaussians and undo, without a browser.
 
-An immutable `State` describes everything that a viewer shows. Each action returns a new state, and a `History` is a
-list of states. A viewer keeps one `SelectionContext` per run, and one `History` per user::
+An immutable `State` describes the query, the selection and the hidden Gaussians of one user. Each action returns a new
+state, and a `History` is a list of states. A viewer keeps one `SelectionContext` per run, and one `History` per user::
 
     space = SelectionContext(field, means)               # shared by all users; caches answers and the neighbor graph
     history = History.of(State(space), lean=State.without_caches)
@@ -18,8 +18,8 @@ Slow work runs with a token from `RequestTokens`. The viewer uses the token to s
 stale results.
 
 * `prompts`: prompts and clicks as rows, each with its vector or its error, and queries made from these rows.
-* `selection`: field and centers of the Gaussians, with connected objects, growing and shrinking.
-* `region`: visible Gaussians inside a polygon or a brush stroke in a view.
+* `selection`: field and centers of the Gaussians; objects around a Gaussian; growing and shrinking of selections.
+* `region`: visible Gaussians inside a polygon or along a brush stroke in a view.
 * `state`: query, selection, hidden Gaussians and layers, with undo, redo and request tokens.
 * `actions`: functions from one state to the next, with histograms, suggested thresholds and warnings about prompts.
 * `objects`: objects of a selection, and camera positions that show them.

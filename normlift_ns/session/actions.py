@@ -23,7 +23,7 @@ from normlift_ns.session.state import BY_HAND, Addition, Layer, State
 
 @dataclass(frozen=True, eq=False)
 class PromptDiagnostics:
-    """Diagnostics of one prompt."""
+    """Histogram and warning of one prompt."""
 
     text: str
     """The prompt."""
@@ -33,10 +33,11 @@ class PromptDiagnostics:
     """Histogram of the relevancies of the prompt."""
     warning: str
     """Warning about the prompt; empty if there is none, and for clicks. If the encoder ignores some words, the warning
-    lists those that it uses. If the verdict is "weak match" or "probably not here", the warning has the largest
-    relevancy and its position. Otherwise, if no Gaussian is selected, it names the setting to change."""
+    lists those that it uses. If the verdict is "weak match" or "probably not here", the warning gives the largest
+    relevancy and the position of the best match. Otherwise, if no Gaussian is selected, it names the setting to
+    change."""
     nearest_position: tuple[float, float, float] | None = None
-    """Position of the largest relevancy, if there is a warning; see `Finding.nearest`."""
+    """Position of the best match, if there is a warning; see `Finding.nearest`."""
 
 
 def diagnose_prompts(state: State, *, max_prompts: int = 3) -> tuple[PromptDiagnostics, ...]:
@@ -82,7 +83,7 @@ def _warning(finding: Finding) -> str:
 
 
 def threshold_suggestion(state: State) -> float | None:
-    """Return the threshold that the relevancies of the shown prompt, or of all prompts together, suggest.
+    """Return the suggested threshold of the prompt `state.shown`, or of all prompts together if it is None.
 
     Return None without a query, or if no Gaussian has a direction.
     """
@@ -93,11 +94,10 @@ def threshold_suggestion(state: State) -> float | None:
 
 
 def carry_threshold(state: State, question: Query) -> Query:
-    """Return `question` with the threshold of the previous query, if both use the same rule.
+    """Return `question` with the threshold of the current query, if both queries use the same rule.
 
-    A query of clicks alone does not pass its threshold to a query with texts, or vice versa.
-
-    If `question` uses the suggested threshold, it gets the previous threshold only if the user chose that threshold.
+    A query of clicks alone does not pass its threshold to a query with texts, or vice versa. If `question` asks for the
+    suggested threshold and the current threshold is a suggested one, `question` is returned unchanged.
     """
     previous = state.query
     if previous is None or (previous.rule, _only_clicks(previous)) != (question.rule, _only_clicks(question)):
@@ -120,8 +120,7 @@ def _only_clicks(question: Query) -> bool:
 
 
 ClickMode = Literal["select", "add", "remove"]
-"""Effect of a click on the clicked object: select only this object, add it to the selection, or remove it from the
-selection."""
+"""Effect of a click: select only the clicked object, add it to the selection, or remove it from the selection."""
 MAX_LAYERS = 32
 MAX_GROW_STEPS = 10
 """Maximum number of steps for growing or shrinking a selection."""
@@ -131,20 +130,23 @@ FLOATERS_HINT = "Likely floaters are selected. Check them, then press Hide. Undo
 
 
 def ask(state: State, prompts: Sequence[Prompt], question: Query | None) -> State:
-    """Apply a new query. Hidden Gaussians stay hidden; clicked selections are dropped.
+    """Replace the query and the selection. Hidden Gaussians stay hidden.
 
     Args:
-        prompts: All prompts, from `build_query`.
+        prompts: All prompts, including those with errors.
         question: Query of these prompts, from `build_query`; None if no prompt has a vector. Nothing is then selected.
     Raises:
-        ValueError: The vectors have a different dimension than the field.
+        ValueError: As in `run_query`.
     """
     did = f"Ask {join_prompts([prompt.text for prompt in prompts])}"
     return _with_suggested_threshold(replace(_unasked(state), prompts=tuple(prompts), query=question, action=did))
 
 
 def update_query(state: State, question: Query | None, did: str) -> State:
-    """Apply a query with the same prompts but a different rule or different features. Clicked selections are kept."""
+    """Apply a query with the same prompts but different settings; return the same state if `question` is None.
+
+    Changes that were made to the selection by hand are kept.
+    """
     return state if question is None else _with_suggested_threshold(replace(state, query=question, action=did))
 
 
@@ -176,10 +178,10 @@ def set_threshold(state: State, value: float) -> State:
 
 
 def use_suggested_threshold(state: State) -> State:
-    """Set the threshold of `threshold_suggestion`.
+    """Set the threshold to the result of `threshold_suggestion`.
 
     Raises:
-        ValueError: The suggestion is None.
+        ValueError: There is no suggestion.
     """
     value = threshold_suggestion(state)
     if value is None:
@@ -196,16 +198,16 @@ def set_min_reliability(state: State, value: float) -> State:
 
 
 def remove_weak(state: State) -> State:
-    """Remove Gaussians with weak evidence from the selection, including clicked ones."""
+    """Remove Gaussians with weak evidence from the selection, including those added by hand."""
     poor = state.selection & (state.space.field.scalars.reliability < WEAK_RELIABILITY)
     return remove(state, poor, "Leave out Gaussians with weak evidence")
 
 
 def show_prompt(state: State, shown: int | None) -> State:
-    """Let only one prompt of the query, or all prompts, select Gaussians, in place of a selection made by hand.
+    """Select Gaussians by one prompt of the query, or by all prompts; this replaces a selection made by hand.
 
     Args:
-        shown: Index of the prompt; None for all prompts.
+        shown: Index of the prompt; None for all prompts. An index out of range changes nothing.
     """
     count = 0 if state.query is None else len(state.query.texts)
     if (shown == state.shown and state.prompts_select) or not 0 <= (shown or 0) < count:
@@ -237,9 +239,9 @@ def pick_gaussian(state: State, weights: Float[Tensor, " n"]) -> int:
 def object_under(state: State, gaussian: int) -> Bool[Tensor, " n"]:
     """Return the mask of the object that contains a Gaussian.
 
-    If an earlier step added the Gaussian with an object, the result is all Gaussians that this step added. Else, if a
-    prompt selects the Gaussian, the object is a connected component of the best prompt's selection, which separates
-    touching objects of different prompts. Otherwise, it is the result of `SelectionContext.object_at`.
+    If an earlier step added the Gaussian with an object, the mask contains all Gaussians that this step added. Else, if
+    a prompt selects the Gaussian, the object is a connected component of the selection of its most relevant prompt.
+    This separates touching objects of different prompts. Otherwise, the mask is that of `SelectionContext.object_at`.
     """
     for one in reversed(state.additions):
         if bool(one.mask[gaussian]):
@@ -265,10 +267,10 @@ def click(state: State, weights: Float[Tensor, " n"], mode: ClickMode = "select"
 
 
 def change_objects(state: State, mask: Bool[Tensor, " n"], mode: ClickMode, text: str = BY_HAND) -> State:
-    """Select, add or remove an object. Removing it later removes only the Gaussians that this step added.
+    """Select, add or remove an object. A click that removes it later removes only the Gaussians added by this step.
 
     Args:
-        text: Prompt of the object.
+        text: Prompt of the object, or `BY_HAND`.
     """
     before = () if mode == "select" else state.additions
     new = mask if mode == "select" else mask & ~state.selection
@@ -289,7 +291,7 @@ def change_selection(state: State, mask: Bool[Tensor, " n"], mode: ClickMode, wh
 
 
 def picked_direction(state: State, weights: Float[Tensor, " n"]) -> Float[np.ndarray, " d"]:
-    """Return the direction of the clicked Gaussian, which is the vector of a prompt named `click_name(...)`.
+    """Return the direction of the clicked Gaussian, as the vector of a prompt whose text is from `click_name`.
 
     Args:
         weights: Weights of the Gaussians on the ray of the click.
@@ -307,7 +309,7 @@ def select(state: State, chosen: Bool[Tensor, " n"], did: str = "Select") -> Sta
 
 
 def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
-    """Add Gaussians to the selection. If it was grown or shrunk, the new selection no longer depends on prompts."""
+    """Add Gaussians to the selection. If it was grown or shrunk, the result no longer depends on prompts."""
     if state.grow_steps != 0:
         return replace(select(state, state.selection | chosen, did), additions=state.additions)
     removed = None if state.removed is None else state.removed & ~chosen
@@ -316,7 +318,7 @@ def add(state: State, chosen: Bool[Tensor, " n"], did: str = "Add") -> State:
 
 
 def remove(state: State, chosen: Bool[Tensor, " n"], did: str = "Remove") -> State:
-    """Remove Gaussians from the selection. If it was grown or shrunk, the new one no longer depends on prompts."""
+    """Remove Gaussians from the selection. If it was grown or shrunk, the result no longer depends on prompts."""
     additions = tuple(replace(one, mask=one.mask & ~chosen) for one in state.additions)
     additions = tuple(one for one in additions if bool(one.mask.any()))
     if state.grow_steps != 0:
@@ -336,7 +338,7 @@ def select_floaters(state: State, floaters: Bool[Tensor, " n"]) -> State:
     Args:
         floaters: Mask of the floaters, from `analysis.objects.find_floaters`.
     Raises:
-        ValueError: The mask is empty.
+        ValueError: The mask contains no Gaussian.
     """
     if not bool(floaters.any()):
         raise InputError("The scene has no likely floaters.")
@@ -355,7 +357,7 @@ def hide(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     Args:
         chosen: Mask of the Gaussians (default: the selection).
     Raises:
-        ValueError: The mask is empty.
+        ValueError: The mask contains no Gaussian.
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
@@ -370,7 +372,7 @@ def show_only(state: State, chosen: Bool[Tensor, " n"] | None = None) -> State:
     Args:
         chosen: Mask of the Gaussians (default: the selection).
     Raises:
-        ValueError: The mask is empty.
+        ValueError: The mask contains no Gaussian.
     """
     chosen = state.selection if chosen is None else chosen
     if not bool(chosen.any()):
@@ -384,7 +386,7 @@ def show_all(state: State) -> State:
 
 
 def add_layer(state: State, name: str) -> State:
-    """Save the selection as a layer, and replace a layer with the same name.
+    """Save the selection as a layer, replacing any layer with the same name.
 
     Raises:
         ValueError: Nothing is selected, the name is empty, or there are too many layers.
@@ -408,7 +410,7 @@ def show_layer(state: State, name: str, *, visible: bool) -> State:
 
 
 def remove_layer(state: State, name: str) -> State:
-    """Remove a layer. If it was hidden, its Gaussians are drawn again, unless they are hidden otherwise."""
+    """Remove a layer. If it was hidden, its Gaussians are drawn again, unless they are hidden for another reason."""
     layer = find_layer(state, name)
     return replace(state, layers=tuple(one for one in state.layers if one is not layer), action=f"Remove layer {name}")
 

@@ -24,31 +24,34 @@ _BY_HAND_COLOR = (1.0, 0.75, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class ObjectRow:
-    """One object of a selection; see `list_objects`."""
+    """One object of a selection; see `list_objects`.
+
+    Means are weighted by W_j, the total weight of Gaussian j over all views.
+    """
 
     text: str
     """The prompt, or "selected by hand"."""
     number: int
-    """Number of the object among those with the same text, from 1: by descending size, or by the order of addition for
-    objects that were added by hand."""
+    """Number of the object among those with the same text, from 1. Objects that were added by hand come first, in the
+    order of addition; the others follow by descending size."""
     color: RGB
-    """Color of the prompt or of selections by hand, RGB in 0..1."""
+    """Color of the prompt, or the color of selections made by hand; RGB in 0..1."""
     mask: Bool[Tensor, " n"]
     """Mask of the object's Gaussians."""
     size: int
     """Number of Gaussians."""
     reliability: float
-    """Mean reliability R of the Gaussians, weighted by the total evidence of each."""
+    """Weighted mean of the reliability R."""
     mean_views: float
-    """Mean effective number of views N_eff of the Gaussians, weighted by the total evidence of each."""
+    """Weighted mean of the effective number of views N_eff."""
     center: tuple[float, float, float]
-    """Mean center of the Gaussians, weighted by the total evidence of each. The camera looks at this position."""
+    """Weighted mean of the Gaussian centers. The camera looks at this position."""
     extent: float
     """Diagonal, in scene units, of the box around the central 90 % of the Gaussian centers along each axis."""
 
     @property
     def name(self) -> str:
-        """The prompt and the number; `io.atomic.safe_file_name` converts it to a file name."""
+        """Text and number of the object; `io.atomic.safe_file_name` converts them to a file name."""
         return f"{self.text} {self.number}"
 
     @property
@@ -63,7 +66,7 @@ class ObjectList:
     """List of the objects of a selection."""
 
     objects: tuple[ObjectRow, ...]
-    """Listed objects, in the order of the prompts and then of their numbers."""
+    """Listed objects, ordered by prompt and then by number."""
     left_out: int
     """Number of objects that are not listed because there are too many."""
     in_smaller_parts: int
@@ -71,14 +74,15 @@ class ObjectList:
 
 
 def list_objects(state: State, *, max_objects: int = 12, min_gaussians: int = OBJECT_MIN_GAUSSIANS) -> ObjectList:
-    """Return the objects among the selected and drawn Gaussians, for each prompt or for a selection made by hand.
+    """List the objects of the drawn part of the selection, for each prompt or for a selection made by hand.
 
-    Objects are connected components. An object that was selected or added by hand stays one object, unless the
-    selection was grown or shrunk.
+    Objects are connected components. In a selection made by hand, each object that was selected or added stays one
+    object, unless the selection was grown or shrunk. If prompts select, Gaussians that were only added by hand do not
+    belong to an object.
 
     Args:
         max_objects: Maximum number of listed objects; the largest object of each prompt has priority.
-        min_gaussians: Minimum number of Gaussians in an object; those in smaller components are only counted.
+        min_gaussians: Minimum number of Gaussians in an object; Gaussians in smaller components are only counted.
     """
     selected, answer = state.selection & state.drawn, state.answer
     rows: list[tuple[int, int, str, RGB, Tensor, int]] = []
@@ -123,12 +127,12 @@ def _object(state: State, text: str, number: int, color: RGB, mask: Tensor, size
 Position = tuple[float, float, float]
 """x, y and z in scene units."""
 _MAX_OCCLUSION = 0.25
-"""Largest mean opacity in front of an object at which the view of it counts as clear."""
+"""Maximum mean opacity in front of an object for a clear view of it."""
 _FILL = 0.8
-"""Fraction of the image height that an object fills if the camera faces it."""
+"""Fraction of the image height that an object fills, seen from the position that `viewpoint` returns."""
 _SIGHT_POINTS = 8
 _AZIMUTHS, _ELEVATIONS = (0, 45, -45, 90, -90, 135, -135, 180), (0, 35)
-"""Angles in degrees of the candidate camera positions, around the vertical and above the current height."""
+"""Azimuths and elevations of the candidate camera positions, in degrees relative to the first candidate."""
 
 
 @dataclass(frozen=True)
@@ -148,19 +152,19 @@ def unoccluded_viewpoint(
     up: Sequence[float] | np.ndarray,
     field_of_view: float = 0.9,
 ) -> Position:
-    """Return the first camera position with a clear view of an object, or the one with the least occlusion.
+    """Return the first candidate camera position with a clear view of an object, else the one with the least occlusion.
 
     The first candidate is on the current side of the object. The others are rotations of it around the vertical, first
-    at the current height, then at a greater height. Occlusion is the mean over several Gaussians of the object; its own
-    Gaussians do not count as occluders.
+    at the same height, then at a greater height. The occlusion is the mean opacity in front of the center and of
+    several Gaussians of the object; the object itself does not count as an occluder.
 
     Args:
         target: Object or point to look at.
         scene: Gaussians that may occlude the target.
-        drawn: Mask of the Gaussians that are drawn (default: all).
+        drawn: Mask of the Gaussians that are drawn; None if all are.
         camera_position: Current position of the camera.
-        up: Direction of the vertical.
-        field_of_view: Field of view of the camera in radians.
+        up: Up direction.
+        field_of_view: Vertical field of view of the camera in radians.
     """
     first = viewpoint(target, camera_position, field_of_view)
     center = torch.tensor(target.center, dtype=torch.float64)
@@ -187,12 +191,12 @@ def unoccluded_viewpoint(
 def viewpoint(
     target: ObjectRow | LookAtTarget, camera_position: Sequence[float] | np.ndarray, field_of_view: float = 0.9
 ) -> Position:
-    """Return a camera position on the current side of an object, from which it fills 80 % of the image height.
+    """Return a camera position on the current side of an object, from which the object fills 80 % of the image height.
 
     Args:
         target: Object or point to look at.
         camera_position: Current position of the camera.
-        field_of_view: Field of view of the camera in radians.
+        field_of_view: Vertical field of view of the camera in radians.
     """
     center = np.asarray(target.center)
     offset = np.asarray(camera_position, float) - center

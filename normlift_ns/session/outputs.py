@@ -26,10 +26,10 @@ def store_query(folder: Path | None, query: Query | None, *, replaces: bool = Fa
     """Store prompts in a run, and return the number of stored prompts as text, such as "2 prompts".
 
     Args:
-        folder: Folder of the field.
+        folder: Folder of the field; None if the run is not stored yet.
         replaces: True to delete the prompts that the run already stores, False to keep them.
     Raises:
-        ValueError: The query or the folder is missing, or `merge_queries` cannot merge the queries.
+        ValueError: The query or the folder is None, or `merge_queries` cannot merge the queries.
     """
     if query is None:
         raise InputError("This session has no query, so it has no prompts to save. Type a prompt and press Ask.")
@@ -41,7 +41,7 @@ def store_query(folder: Path | None, query: Query | None, *, replaces: bool = Fa
 
 
 def splat_bytes(splat: TrainedSplat, state: State, mask: Bool[Tensor, " n"], name: str) -> tuple[str, bytes, int]:
-    """Return the name and content of a PLY file of the Gaussians in `mask`, and their number.
+    """Return the name and content of a PLY file of the Gaussians in `mask`, and the number of Gaussians in the file.
 
     Raises:
         ValueError: The mask has no Gaussian that a renderer draws.

@@ -28,11 +28,11 @@ EncodeTexts = Callable[[Sequence[str]], Any]
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """One row of a query."""
+    """Text or click with its vector, or with an error."""
 
     text: str
     vector: Float[np.ndarray, " d"] | None = None
-    """Vector of the prompt; None if it has an error."""
+    """Vector of the prompt; None if there is an error."""
     error: str = ""
     """Error message for the user; empty without an error."""
 
@@ -43,7 +43,7 @@ class Prompt:
 
 
 def click_name(number: int) -> str:
-    """Return the prompt text that stands for a click; its vector is the direction of the clicked Gaussian."""
+    """Return the prompt text that stands for a click. The prompt's vector is the direction of the clicked Gaussian."""
     return f"like click {number}"
 
 
@@ -57,12 +57,12 @@ def is_click(text: str) -> bool:
 
 
 def encode_prompts(text: str, read: EncodeTexts, known_vectors: Mapping[str, Any] | None = None) -> tuple[Prompt, ...]:
-    """Encode a line of prompts. If a prompt cannot be encoded, its row has the error message of the encoder.
+    """Encode a line of prompts. A prompt that cannot be encoded gets the error message of the encoder.
 
     Args:
         text: Prompts as the user typed them.
-        read: Encoder of texts.
-        known_vectors: Vectors of clicks and of prompts stored in the run, by text; they need no encoder.
+        read: Function that encodes texts.
+        known_vectors: Vectors of clicks and of prompts stored in the run, by text; they do not need an encoder.
     Raises:
         ValueError: The text has no prompts, or more than `MAX_PROMPTS`.
         OSError, MemoryError: The encoder cannot be loaded.
@@ -109,17 +109,17 @@ def build_query(
     min_reliability: float = 0.0,
     refined: bool = True,
 ) -> tuple[tuple[Prompt, ...], Query]:
-    """Build the query of all rows that have a vector.
+    """Build the query of all prompts that have a vector.
 
     A query of clicks alone uses the rule cosine and, by default, the suggested threshold. It is not gated, because a
     clicked Gaussian is in the scene. A query of clicks and texts requires the rule cosine.
 
     Args:
-        read: Encoder of the negatives. The other arguments are those of `make_query`.
+        read: Function that encodes the negatives. The keyword arguments are those of `make_query`.
     Returns:
-        The rows, with an error for each click if the rule is not cosine, and their query.
+        The prompts, with an error for each click if the rule is not cosine, and the query.
     Raises:
-        ValueError: No row has a vector, or an argument is not valid (see `make_query`).
+        ValueError: No prompt has a vector, or an argument is not valid (see `make_query`).
     """
     rows = tuple(prompts)
     clicks = [prompt.is_click for prompt in rows if prompt.vector is not None]
@@ -138,7 +138,7 @@ def build_query(
 
 
 def _question(field: HasManifest, prompts: Sequence[Prompt], read: EncodeTexts, options: Mapping[str, Any]) -> Query:
-    """Return the query of the rows that have a vector."""
+    """Return the query of the prompts that have a vector."""
     vectors: dict[str, Any] = {prompt.text: prompt.vector for prompt in prompts if prompt.vector is not None}
 
     def encode(texts: Sequence[str]) -> np.ndarray:
@@ -148,7 +148,7 @@ def _question(field: HasManifest, prompts: Sequence[Prompt], read: EncodeTexts, 
 
 
 def prompts_of_query(question: Query | None) -> tuple[Prompt, ...]:
-    """Return the rows of a query, such as the query stored in a run; () for None."""
+    """Return the prompts of a query, such as the query stored in a run, with their vectors; () for None."""
     if question is None:
         return ()
     return tuple(Prompt(text, np.asarray(row)) for text, row in zip(question.texts, question.embeddings))
@@ -157,11 +157,13 @@ def prompts_of_query(question: Query | None) -> tuple[Prompt, ...]:
 def merge_queries(stored: Query | None, asked: Query) -> Query:
     """Merge stored and new prompts into one query; a new prompt replaces a stored prompt with the same text.
 
+    The other settings are those of `asked`.
+
     Args:
         stored: Query stored in the run; None if it has none.
         asked: Query to add.
     Raises:
-        ValueError: The queries differ in rule, negatives or refinement.
+        ValueError: The queries differ in rule, negatives or `refined`.
     """
     if stored is None:
         return asked

@@ -1,4 +1,4 @@
-"""Selection of the visible Gaussians inside a region of a view, which is a polygon or a brush stroke."""
+"""Selection of the visible Gaussians inside a polygon or along a brush stroke in a view."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from normlift_ns.options import RasterizeMode
 from normlift_ns.rasterization.rasterize import render
 
 _RENDER_SIZE = 320
-"""Maximum longer side, in pixels, of the render for visibility."""
+"""Maximum longer side, in pixels, of the render that determines visibility."""
 _MARGIN = 0.03
 
 
@@ -60,10 +60,10 @@ def project(means: Float[Tensor, "n 3"], camera: Camera) -> tuple[Float[np.ndarr
 def visible_gaussians(
     scene: GaussianScene, camera: Camera, drawn: Bool[Tensor, " n"], *, rasterize_mode: RasterizeMode = "classic"
 ) -> Bool[Tensor, " n"]:
-    """Return the mask of the drawn Gaussians that lie on the visible surface of a view.
+    """Return the mask of the drawn Gaussians that lie on or in front of the visible surface of a view.
 
     The depth of the surface is the mean depth rendered at the pixel of the Gaussian's center. A Gaussian may lie behind
-    the surface by twice its largest standard deviation, or by 3 % of the surface's depth if that is more.
+    the surface by up to twice its largest standard deviation, or 3 % of the surface's depth if that is more.
 
     Args:
         drawn: Mask of the Gaussians that are drawn.

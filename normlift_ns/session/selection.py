@@ -34,7 +34,7 @@ _COSINE_STEP = 0.05
 
 @dataclass(frozen=True, eq=False)
 class SelectionContext:
-    """Field and centers of its Gaussians, with caches. Several users can share it."""
+    """Semantic field and the centers of its Gaussians, with caches that several users can share."""
 
     field: SemanticField
     means: Float[Tensor, "n 3"]
@@ -52,7 +52,7 @@ class SelectionContext:
         """Return the answer to a query, as `run_query` does; cache the relevancies of the last four queries.
 
         Raises:
-            ValueError: The vectors have a different dimension than the field, or negatives are missing.
+            ValueError: As in `run_query`.
         """
         negative = None if question.negative_embeddings is None else question.negative_embeddings.tobytes()
         key = (question.texts, question.embeddings.tobytes(), negative, question.rule, question.refined)
@@ -68,14 +68,14 @@ class SelectionContext:
     def similar_to(
         self, vector: Float[Tensor, " d"], least: float = CLICK_THRESHOLD, *, refined: bool = True
     ) -> Bool[Tensor, " n"]:
-        """Return the mask of the Gaussians whose cosine to `vector` is at least `least`."""
+        """Return the mask of the Gaussians whose direction has a cosine of at least `least` with `vector`."""
         cosine = self.field.query(vector[None], refined=refined)[:, 0]
         return (cosine >= least) & self.field.valid(refined=refined)
 
     def object_at(self, gaussian: int, selected: Bool[Tensor, " n"], *, refined: bool = True) -> Bool[Tensor, " n"]:
-        """Return the mask of the connected object around a Gaussian.
+        """Return the mask of the object around a Gaussian.
 
-        It is a connected component of the selection if the Gaussian is selected. Otherwise, it is a connected
+        The object is a connected component of the selection if the Gaussian is selected. Otherwise, it is a connected
         component of all Gaussians similar to this one.
 
         Args:
@@ -94,8 +94,8 @@ class SelectionContext:
         """Return the selection grown (steps > 0) or shrunk (steps < 0) over the neighbor graph.
 
         Each step of growing adds the nearest neighbors of the selection. Growing also adds Gaussians that are connected
-        to the selection and similar to its mean direction. Their cosine is at least 0.95 for one step, and the limit
-        decreases by 0.05 with each further step.
+        to the selection and similar to its mean direction. Their cosine with this direction is at least 0.95 for one
+        step, and the limit decreases by 0.05 with each further step.
 
         In each connected component, shrinking keeps the Gaussians near the middle of the component. Their graph
         distance to the middle is at most a fraction of the largest distance. The fraction is 10/11 for one step, and
@@ -154,7 +154,10 @@ class SelectionContext:
 
     @cached_property
     def neighbor_pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of neighbors: the 8 nearest within `OBJECT_MAX_GAP` times the median distance to the 8th neighbor."""
+        """Indices of the first and of the second Gaussian of each pair of neighbors.
+
+        The neighbors of a Gaussian are the 8 nearest within `OBJECT_MAX_GAP` times the median distance to the 8th.
+        """
         neighbors = nearest_neighbors(self.means.detach().cpu(), _NEIGHBORS)
         last = neighbors.distance[:, -1]
         last = last[last.isfinite()]

@@ -26,7 +26,7 @@ class Layer:
     name: str
     mask: Bool[Tensor, " n"]
     visible: bool = True
-    """True if the viewer draws the Gaussians of the layer."""
+    """False to hide the Gaussians of the layer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +56,13 @@ class State:
     query: Query | None = None
     """Query of the prompts that have no errors, with the threshold and the minimum reliability."""
     shown: int | None = None
-    """Index of the only prompt that selects; None if all prompts of the query select."""
+    """Index of the only prompt that selects Gaussians; None if all prompts of the query do."""
     prompts_select: bool = True
-    """True if the prompts select; False if the selection was made by hand."""
+    """True if prompts select Gaussians; False if the selection was made by hand."""
     added: Bool[Tensor, " n"] | None = None
     removed: Bool[Tensor, " n"] | None = None
     additions: tuple[Addition, ...] = ()
-    """Objects that were selected or added, in this order."""
+    """Objects that were selected or added, in chronological order."""
     grow_steps: int = 0
     """Number of growing steps over the neighbor graph; a negative number shrinks the selection."""
     hidden: Bool[Tensor, " n"] | None = None
@@ -109,7 +109,7 @@ class State:
 
     @property
     def name(self) -> str:
-        """Name for a file of the selection: the prompts that select, or those of selected objects, else "selection"."""
+        """Name for a file of the selection: the selecting prompts, or those of selected objects, or "selection"."""
         if self.query is None or not self.prompts_select:
             texts = tuple(dict.fromkeys(one.text for one in self.additions))
             return join_prompts(texts) if texts != () and BY_HAND not in texts else "selection"
@@ -118,7 +118,7 @@ class State:
 
     @property
     def refined(self) -> bool:
-        """True if the query uses refined features."""
+        """True if the query uses refined features, or if there is no query."""
         return True if self.query is None else self.query.refined
 
     @cached_property
@@ -162,7 +162,7 @@ class History(Generic[T]):
     """Key of the last step, if successive steps with this key are merged."""
 
     compact: Callable[[T], T] = lambda state: state
-    """Function applied to the current state before it is replaced, for instance `State.without_caches`."""
+    """Function applied to the current state before another becomes current, for instance `State.without_caches`."""
 
     @staticmethod
     def of(state: T, *, lean: Callable[[T], T] = lambda state: state) -> History[T]:
@@ -219,7 +219,7 @@ class RequestToken:
 
 @dataclass
 class RequestTokens:
-    """Request tokens of one user. Methods may be called from any thread.
+    """Tokens of the requests of one user; a new request makes earlier ones stale. Any thread may call the methods.
 
     >>> turns = RequestTokens()
     >>> first, second = turns.start("Reading red"), turns.start("Reading blue")

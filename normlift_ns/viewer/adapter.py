@@ -38,7 +38,8 @@ KEYS_SCRIPT = """
   });
 })();
 """
-"""Script for the keys Enter and Escape, which viser 0.2.7 does not handle. viser sends typed text every 50 ms."""
+"""Script that makes Enter press Ask and Escape press Cancel, because viser 0.2.7 does not handle these keys. Enter
+takes effect after 150 ms, because viser sends typed text only every 50 ms."""
 
 
 def handle_in_order(server: Any) -> None:
@@ -84,9 +85,9 @@ def send_in_order(server: Any) -> None:
 
 
 def _send_in_order(connection: Any) -> None:
-    """Make a connection send its messages in order, and those within `atomic` together at its end.
+    """Make a connection send its messages in order, and those within `atomic` together when its context ends.
 
-    viser 0.2.7 passes each message within its `atomic` to one of 32 threads that serve all pages. The thread is blocked
+    viser 0.2.7 passes each message within `atomic` to one of 32 threads that serve all pages. The thread is blocked
     until the context ends, so a panel of sixty widgets blocks all pages while it is created. Later messages can
     overtake waiting ones, two threads can deadlock, and an exception within the context always causes a deadlock.
     """
@@ -118,8 +119,8 @@ def _send_in_order(connection: Any) -> None:
 def add_button_group(gui: Any, label: str, options: Sequence[str], pressed: Callable[[str, Any], None]) -> Any:
     """Add a row of buttons to a panel; an empty label takes no space.
 
-    This function works around an error in viser 0.2.7. viser ignores a second press of the same button of a group, and
-    a press of its first button before any other press.
+    This function works around an error in viser 0.2.7. viser ignores a repeated press of the same button of a group,
+    and a press of its first button before any other press.
 
     Args:
         pressed: Function to call with the caption of the pressed button and viser's event.
@@ -136,7 +137,7 @@ def add_button_group(gui: Any, label: str, options: Sequence[str], pressed: Call
 
 
 def ignore_closed_clients(server: Any) -> None:
-    """Suppress tracebacks about messages from pages that were closed before viser handled the messages.
+    """Suppress tracebacks about messages whose pages were closed before viser handled them.
 
     viser 0.2.7 handles messages in another thread. In this thread, viser and nerfstudio 1.1.5 look up the page by its
     number, and viser prints a traceback if the page no longer exists.

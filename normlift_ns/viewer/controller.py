@@ -28,7 +28,7 @@ _CLICK_MODES: dict[Action, ClickMode] = {Action.SELECT: "select", Action.ADD: "a
 
 
 def _show_prompt(state: State, option: str) -> State:
-    """Select by the prompt that belongs to an option of the dropdown, or by all prompts."""
+    """Select Gaussians by the prompt of a dropdown option, or by all prompts."""
     return actions.show_prompt(state, None if option == ALL_PROMPTS else int(option.split(":", maxsplit=1)[0]) - 1)
 
 
@@ -78,9 +78,9 @@ class Controller(ABC):
     """
 
     reading_message: str
-    """Message while prompts are encoded."""
+    """Message shown while prompts are encoded."""
     floaters_message = actions.FLOATERS_HINT
-    """Message after floaters are selected."""
+    """Message shown after floaters are selected."""
 
     def __init__(self, session: Session, explanation: Explanation) -> None:
         self._session, self._reasons = session, explanation
@@ -105,7 +105,7 @@ class Controller(ABC):
 
     @property
     def history(self) -> History[State]:
-        """History of the session; not available before there is a field."""
+        """History of the session; only valid if `state` is not None."""
         return cast("History[State]", self._session.history)
 
     @property
@@ -118,7 +118,7 @@ class Controller(ABC):
 
         Args:
             value: Value of a slider or a choice, or row of an object.
-            client: viser's handle of the user's browser.
+            client: viser's client handle of the user's browser.
         """
         self._guard(lambda: self._act(action, value, client))
 
@@ -151,7 +151,7 @@ class Controller(ABC):
 
     @abstractmethod
     def _known_vectors(self) -> dict[str, Any]:
-        """Return the vectors of clicks and of stored prompts, which do not need an encoder."""
+        """Return the vectors of clicks and of stored prompts, by text; they do not need an encoder."""
 
     @abstractmethod
     def _query_settings(self) -> dict[str, Any]:
@@ -171,7 +171,7 @@ class Controller(ABC):
 
     @abstractmethod
     def _clear(self) -> None:
-        """Remove the query and the selection, and reset the settings of queries."""
+        """Remove the query and the selection, and reset the query settings."""
 
     @abstractmethod
     def _download(self, mask: Bool[Tensor, " n"], name: str, client: Any) -> None:
@@ -308,7 +308,7 @@ class Controller(ABC):
 
         Args:
             clicked: Direction of the clicked Gaussian.
-            stored: Prompt texts that are already in use, in addition to those of other clicks.
+            stored: Texts of the prompts stored in the run, which the new click must not reuse.
         """
         with self._lock:
             names = {*self._session.clicks, *stored}

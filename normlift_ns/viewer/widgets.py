@@ -28,7 +28,7 @@ from normlift_ns.viewer.adapter import add_button_group
 
 
 class Action(Enum):
-    """Action of a user in a viewer. The value is the caption of the action's button, if it has a button."""
+    """Action of a user in a viewer. The value is the caption of the action's button or slider, if it has one."""
 
     ASK = "Ask"
     CANCEL = "Cancel"
@@ -61,7 +61,7 @@ class Action(Enum):
 Act = Callable[[Action, Any, Any], None]
 """Function of an action, the value of the action, and the browser that sent the action."""
 SLIDERS = (Action.THRESHOLD, Action.RELIABILITY, Action.GROW)
-"""Actions of sliders, whose successive calls are merged into one step of the history."""
+"""Actions of sliders. Successive actions of one slider are merged into one step of the history."""
 ALL_PROMPTS = "all prompts"
 
 
@@ -89,7 +89,7 @@ class ActionWidgets:
         self._values: dict[Action, Any] = {}
 
     def show_state(self, state: State) -> None:
-        """Show a state in every widget except the text boxes."""
+        """Show a state in the sliders and the prompt dropdown, and show `remove_weak` if there is a warning."""
         texts = () if state.answer is None else state.answer.texts
         options = (ALL_PROMPTS, *(f"{i + 1}: {clip_text(text, 30)}" for i, text in enumerate(texts)))
         if tuple(self.shown.options) != options:
@@ -143,7 +143,7 @@ class ActionWidgets:
         return widget
 
     def _set(self, action: Action, widget: Any, value: Any) -> None:
-        """Set a widget without calling `act`. Keep a change of the user that `act` has not received yet."""
+        """Set a widget without calling `act`, unless it has a change by a user that `act` has not received yet."""
         if widget.value == self._values[action]:
             self._reset(action, widget, value)
 
@@ -157,7 +157,8 @@ class ActionWidgets:
 def escape_mdx(text: str) -> str:
     """Escape a text so that MDX shows it literally.
 
-    Characters that could be markup or code become character references. Unprintable ones become escape sequences.
+    Unprintable characters become escape sequences. Then all characters except letters, digits and spaces become
+    character references.
 
     >>> escape_mdx("a {b}")
     'a &#123;b&#125;'
@@ -231,7 +232,7 @@ def prompt_rows(
 
     Args:
         headings: Headings of the columns of numbers.
-        numbers: Numbers by prompt, in the order of the query.
+        numbers: Formatted numbers by prompt text, in the order of the query.
         max_rows: Maximum number of prompts in the table.
     """
     colors = dict(zip(numbers, prompt_rgb_tuples(tuple(numbers))))
@@ -334,7 +335,7 @@ def _image(media_type: str, content: bytes) -> str:
 
 _BUSY = "Finding supporting images …"
 _explain_lock = Lock()
-"""Lock for reading and caching votes, so that no two threads do it at the same time."""
+"""Lock for reading and caching votes, so that only one thread at a time does so."""
 
 
 def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refined: bool = True) -> str:
@@ -362,7 +363,7 @@ def explanation_mdx(votes: RecordedVotes, selected: Bool[Tensor, " n"], *, refin
 
 
 def _list_votes(votes: Sequence[ViewVote], names: Sequence[str], images: dict[int, str]) -> list[str]:
-    """Return lines with the numbers of each view, and with its image unless it is already in the panel."""
+    """Return lines with the numbers of each vote, and with the image of its view unless an earlier line has it."""
     lines = []
     for vote in votes:
         regions = "1 region" if len(vote.regions) == 1 else f"{len(vote.regions)} regions"
@@ -416,7 +417,7 @@ class Explanation:
             self.content = content
 
     def update(self, state: State) -> None:
-        """Drop the explanation if this state has a different selection."""
+        """Drop the explanation if the selection of a state differs from the explained selection."""
         if self._selection is not None and not torch.equal(self._selection, state.selection):
             self.clear()
 
