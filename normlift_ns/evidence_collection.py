@@ -267,8 +267,8 @@ def observe_views(
         view, labels = waiting.popleft(), result.labels
         if labels.shape != view.image.shape[:2]:
             raise InputError(
-                f"the labels of {view.name} are {tuple(labels.shape)}, but the image is {tuple(view.image.shape[:2])} "
-                "(height x width); make the feature source label every pixel"
+                f"the labels of {view.name} have size {tuple(labels.shape)} (height x width), but the image has size "
+                f"{tuple(view.image.shape[:2])}; make the feature source return labels of the size of the image"
             )
         block.cameras.append(view.camera)
         block.labels.append(labels if view.mask is None else labels.where(view.mask, MASKED))

@@ -155,10 +155,10 @@ class LiftedRun:
 
         Args:
             texts: Prompts for the text encoder of the run.
-            vectors: Vectors [D] of further prompts by name, in the space of the features. They may have any norm > 0,
-                and need no text encoder unless the rule compares with negatives.
-            negatives: Negative prompts for the rules lerf and margin. If None, use those of the encoder, or else
-                `CANONICAL_NEGATIVES`.
+            vectors: Vectors [D] of further prompts by name, in the space of the features. They may have any norm > 0.
+                A query without texts and negatives needs no text encoder.
+            negatives: Negative prompts for the rules lerf and margin. If None, these rules use `CANONICAL_NEGATIVES`,
+                or the default negatives of the encoder if the lift did not compare the scene with unrelated words.
             relevancy: Formula that computes relevancy from cosines; see `normlift_ns.relevancy`. "auto" is lerf if
                 `negatives` has prompts, and cosine if `negatives` is empty. If `negatives` is None, "auto" is contrast
                 if the lift compared the scene with unrelated words, else the default rule of the encoder.

@@ -803,8 +803,9 @@ class AskOptions:
     """
 
     negatives: tuple[str, ...] | None = None
-    """Negative prompts for the formulas lerf and margin. None: object, things, stuff and texture (from LERF), except
-    for encoders of plugins with negative prompts of their own."""
+    """Negative prompts for the formulas lerf and margin. None: object, things, stuff and texture (from LERF).
+    Encoders of plugins can have other defaults, which apply if the lift did not compare the scene with unrelated
+    words."""
     relevancy: RelevancyRule | Literal["auto"] = "auto"
     """Relevancy formula. cosine: the cosine of prompt and Gaussian. contrast: the softmax against the cosine that 3% of
     unrelated words reach at the same Gaussian. lerf: the smallest softmax against one negative prompt. margin: the

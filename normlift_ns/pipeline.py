@@ -144,7 +144,8 @@ def lift_run(
         timestamp: Name of the new run directory. If None, use the current time, with a number if such a run exists.
         overwrite: Replace an existing run directory of that name. For exported files, see `FeatureExport.overwrite`.
         check_alignment: Compare a few training images with renders of the scene before the lift. Warn if they differ.
-            Raise if they show almost no Gaussians or, for a splat without a nerfstudio run, another scene.
+            Raise if the training images show almost no Gaussians or, for a splat without a nerfstudio run, if the
+            renders do not match the images at all.
         device: Device to lift on: auto, cpu or cuda.
         export: Destination of a copy of the 2D features, as LangSplat files. If None, write no copy.
         report: Progress callback, called with (stage, steps done, total steps).

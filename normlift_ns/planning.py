@@ -648,7 +648,11 @@ def _per_view(observed: _Observed) -> float | None:
 def _observe_loaded(
     indices: Sequence[int], observe: Callable[[Sequence[int]], _Observed], batch: int
 ) -> tuple[_Observed, float]:
-    """Observe views; return them with the seconds needed once networks are loaded, and the seconds to load networks."""
+    """Observe views, or only some of them if the first is slow.
+
+    Return the views with their seconds, and the seconds of loading networks, which are not included. If there is a
+    single view, its seconds include the loading.
+    """
     if len(indices) == 0:
         return _Observed(evidence_collection.ViewBatch([], [], [], []), 0.0), 0.0
     first = observe(indices[:1])

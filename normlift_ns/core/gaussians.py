@@ -164,7 +164,8 @@ class Camera:
 
     def camera_to_world(self) -> Float64[Tensor, "4 4"]:
         """Return the camera-to-world matrix in nerfstudio's OpenGL convention: x right, y up, z backward."""
-        return self.world_to_camera.double().inverse() * torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
+        pose = self.world_to_camera.double()
+        return pose.inverse() * pose.new_tensor([1.0, -1, -1, 1])
 
     @check_arguments
     def downscaled(self, factor: float) -> Camera:

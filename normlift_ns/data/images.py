@@ -122,7 +122,8 @@ def blend_background(image: UInt8[Tensor, "h w c"], background: Float[Tensor, " 
 
 
 _NERFSTUDIO_MODES = {"RGB", "RGBA", "L", "CMYK"}
-"""Pillow modes that nerfstudio accepts; it reads CMYK with wrong colors."""
+"""Pillow modes that are accepted in the datasets of runs, because nerfstudio misreads others. It reads CMYK with wrong
+colors, too; such images cause a warning."""
 
 
 def _scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:

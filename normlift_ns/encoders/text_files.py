@@ -191,15 +191,18 @@ class TextEmbeddingFile(LazyTextEncoder):
                 f"file of text embeddings {self.file} is damaged or cannot be read as an NPZ file ({error}); write it "
                 "again with numpy.savez(file, **{text: vector, ...})"
             ) from None
-        lengths = {array.shape for array in arrays.values()}
         for name, array in arrays.items():
-            if array.ndim != 1 or array.dtype.kind != "f" or len(lengths) > 1:
+            if array.ndim != 1 or array.dtype.kind != "f":
                 raise InputError(
-                    f"{self.file}: the array of {name!r} is {array.dtype} {array.shape}; expected floats, [D], with "
-                    f"the same D for all prompts (found {', '.join(map(str, sorted(lengths)))})"
+                    f"{self.file}: the array of {name!r} has type {array.dtype} and shape {array.shape}, expected a "
+                    "vector of floating-point numbers"
                 )
             if not np.isfinite(array).all() or not array.any():
                 raise InputError(f"{self.file}: the vector of {name!r} is zero or not finite; encode the prompt again")
+        lengths = sorted({len(array) for array in arrays.values()})
+        if len(lengths) > 1:
+            found = ", ".join(map(str, lengths))
+            raise InputError(f"{self.file} has vectors of different lengths ({found}); encode all prompts with one encoder")
         return {name: array.astype(np.float64) for name, array in arrays.items()}
 
 

@@ -509,9 +509,10 @@ def _mean_of_pixels(
 
 
 def positions_around(space: FreeSpace, target: Float64[Tensor, " 3"]) -> Float64[Tensor, "p 3"]:
-    """Return free positions for cameras that face a target.
+    """Return free positions for new cameras that face a target.
 
-    They are camera positions, and positions on two rings around the target at the median height of the cameras.
+    The candidates are the positions of the capture's cameras, and positions on two rings around the target, at the
+    median height of those cameras.
     """
     away = space.camera_positions - target
     height = away @ space.up

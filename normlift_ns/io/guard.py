@@ -17,7 +17,7 @@ from typing import Any
 from normlift_ns.errors import InputError
 
 MAX_TEXT_BYTES = 2**26
-"""Maximum size of a text file, in bytes. Text files of normlift_ns have a few thousand bytes."""
+"""Maximum size of a text file that is read, in bytes. Such files are usually much smaller."""
 
 
 def open_regular(path: str | Path, *, max_bytes: int | None = None) -> BufferedReader:

@@ -28,6 +28,7 @@ from normlift_ns.io.atomic import atomic_file, atomic_files
 from normlift_ns.io.guard import refuse_inputs
 from normlift_ns.options import RelevancyRule, check_path
 from normlift_ns.server.schema import (
+    MAX_FEATURES,
     Arrays,
     ExplainResult,
     ObjectsResult,
@@ -230,11 +231,13 @@ class RemoteRun:
         Gaussians without a direction have zeros.
 
         Raises:
-            ValueError: The range is not valid, or has more than 131,072 Gaussians.
+            ValueError: The range is empty or extends beyond the scene.
             OSError: The server does not respond.
         """
-        query = f"features?start={start}" + ("" if stop is None else f"&stop={stop}")
-        return torch.from_numpy(np.load(io.BytesIO(self._get(self._path(query)))))
+        stop = self.info["num_gaussians"] if stop is None else stop
+        firsts = range(start, max(stop, start + 1), MAX_FEATURES)
+        paths = [self._path(f"features?start={first}&stop={min(stop, first + MAX_FEATURES)}") for first in firsts]
+        return torch.cat([torch.from_numpy(np.load(io.BytesIO(self._get(path)))) for path in paths])
 
     @check_arguments
     def render(
@@ -408,7 +411,7 @@ def connect(url: str, run: str | None = None, *, access_token: str = "") -> Remo
         run: Id of the run (default: the only run of the server).
         access_token: Token printed by the server; needed to store prompts unless the server listens on localhost only.
     Raises:
-        ValueError: The address is not valid, or the server does not have this run.
+        ValueError: The address is not that of a server of normlift_ns, or the server does not have this run.
         OSError: The server does not respond.
 
     >>> try:
@@ -426,7 +429,10 @@ def connect(url: str, run: str | None = None, *, access_token: str = "") -> Remo
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise wrong
     remote = RemoteRun(f"{parts.scheme}://{parts.netloc}", run or "", access_token)
-    ids = [one["id"] for one in json.loads(remote._get("/api/runs"))["runs"]]
+    try:
+        ids = [one["id"] for one in json.loads(remote._get("/api/runs"))["runs"]]
+    except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError):
+        raise InputError(f"{remote.address} is not a server of normlift_ns; check the address") from None
     if run is None and len(ids) == 1:
         remote.id = ids[0]
     if remote.id not in ids:

@@ -26,8 +26,6 @@ from normlift_ns.server.protocol import decode, make_codes
 from normlift_ns.server.runs import ServedRun
 from normlift_ns.session.state import State
 
-MAX_FEATURES = 2**17
-"""Maximum number of Gaussians in one request for features."""
 T = TypeVar("T")
 _BINARY = "application/octet-stream"
 _MAY_NOT_WRITE = (
@@ -154,13 +152,13 @@ def features(served: ServedRun, query: Any) -> Content:
     """Return the unit features [M, D] of a range of Gaussians as an NPY file, with zeros for those without a direction.
 
     Raises:
-        ValueError: The range is empty, extends beyond the scene, or has more than `MAX_FEATURES` Gaussians.
+        ValueError: The range is empty, extends beyond the scene, or has more than `schema.MAX_FEATURES` Gaussians.
     """
     count = len(served.space)
     start, stop = (int(_number(name, query.get(name, str(end)))) for name, end in (("start", 0), ("stop", count)))
-    if not 0 <= start < stop <= count or stop - start > MAX_FEATURES:
+    if not 0 <= start < stop <= count or stop - start > schema.MAX_FEATURES:
         raise InputError(
-            f"start and stop must satisfy 0 <= start < stop <= {count:,} and differ by at most {MAX_FEATURES:,}, "
+            f"start and stop must satisfy 0 <= start < stop <= {count:,} and differ by at most {schema.MAX_FEATURES:,}, "
             f"got {start:,} and {stop:,}."
         )
     return npy(

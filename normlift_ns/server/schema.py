@@ -25,6 +25,8 @@ from normlift_ns.session.state import State
 Prompt = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Arrays = Literal["none", "safetensors"]
+MAX_FEATURES = 2**17
+"""Maximum number of Gaussians in one request for features."""
 
 
 class Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -252,12 +254,15 @@ def select_state(served: ServedRun, selection: Selection) -> State:
     """Return a state with the requested selection.
 
     Raises:
-        ValueError: A prompt cannot be encoded, the object does not exist, the ray or the region selects no Gaussian, or
+        ValueError: A prompt cannot be encoded, the prompt or the object does not exist, the ray or the region selects no Gaussian, or
             the mask has the wrong size.
     """
     state = State(served.space, color_mode="overlay")
     if selection.question is not None:
         state = actions.ask(state, *encode_question(served, selection.question))
+        texts = selection.question.texts
+        if (selection.prompt or 0) >= len(texts):
+            raise InputError(f"prompt is {selection.prompt}, expected an index from 0 to {len(texts) - 1}")
         state = actions.show_prompt(state, selection.prompt)
     if selection.object is not None:
         state = actions.select(state, find_object(state, selection.object).mask)

@@ -124,12 +124,12 @@ def test_entries_of_text_vectors_are_checked_before_they_are_read(tmp_path: Path
         (entry("fox", ones[:-3]), ["'fox'", "float64 needs 32 bytes", "29"]),
         (entry("fox", ones, npy(np.arange(4.0))), ["two vectors for 'fox'"]),
         (npz(fox=np.ones(4, np.longdouble)), ["'fox'", np.dtype(np.longdouble).name]),
-        (npz(fox=np.ones((2, 4))), ["'fox'", "float64 (2, 4)"]),
-        (npz(fox=np.ones(4, int)), ["'fox'", "int64 (4,)"]),
+        (npz(fox=np.ones((2, 4))), ["'fox'", "float64", "(2, 4)"]),
+        (npz(fox=np.ones(4, int)), ["'fox'", "int64", "(4,)"]),
         (npz(fox=np.zeros(4)), ["'fox'", "zero or not finite"]),
         (npz(fox=np.array([1, np.nan])), ["'fox'", "zero or not finite"]),
         (npz(fox=np.array([{}], dtype=object)), ["'fox'", "objects"]),
-        (npz(fox=np.ones(4), mug=np.ones(5)), ["same D"]),
+        (npz(fox=np.ones(4), mug=np.ones(5)), ["different lengths (4, 5)"]),
         (b"PK no archive", ["NPZ"]),
     ):
         (tmp_path / "t.npz").write_bytes(content)

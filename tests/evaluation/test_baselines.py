@@ -126,7 +126,7 @@ def test_features_that_cannot_be_made_again_are_refused(lifted):
     for change, message in (
         ({"source": None}, "does not record"),
         ({"source": {"wings": 2}}, "wings"),
-        ({"source": [1]}, "found list"),
+        ({"source": [1]}, "found a list"),
         ({"source": {"encoder": 3}}, "encoder"),
         ({"features": {"kind": "other"}}, '{"kind": "other"}'),
     ):

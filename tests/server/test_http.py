@@ -40,7 +40,7 @@ def client(tmp_path):
         yield client
 
 
-def test_a_client_answers_as_the_run_itself(served_room, tmp_path):
+def test_a_client_answers_as_the_run_itself(served_room, tmp_path, monkeypatch):
     run, remote = served_room
     local, answer = run.ask("red", "yellow"), remote.ask("red", "yellow")
     assert torch.equal(answer.relevancy, local.relevancy) and torch.equal(answer.selected, local.selected)
@@ -59,7 +59,8 @@ def test_a_client_answers_as_the_run_itself(served_room, tmp_path):
     assert why.effective_views == pytest.approx(expected.n_eff)
     assert why.support[0].name == run.votes.names[expected.views[0].view]
     assert remote.catalogue(answer) == json.loads(json.dumps(run.catalogue(local).to_json()))
-    torch.testing.assert_close(remote.features(5, 9), run.field.directions(torch.arange(5, 9)))
+    monkeypatch.setattr("normlift_ns.server.client.MAX_FEATURES", 1000)  # of one request
+    torch.testing.assert_close(remote.features(5), run.field.directions(torch.arange(5, len(run.field))))
     camera = remote.camera("0001")
     assert torch.allclose(camera.world_to_camera, run.camera("0001").world_to_camera)
     image, plain = remote.render(camera, answer["red"]), remote.render("0001")
@@ -79,6 +80,8 @@ def test_a_client_answers_as_the_run_itself(served_room, tmp_path):
         lambda: remote.why(torch.zeros(3, dtype=torch.bool)),
         lambda: remote.camera("none"),
         lambda: remote.select("red"),
+        lambda: remote.select(Selection(answer.question, prompt=2)),
+        lambda: remote.features(9, 9),
         lambda: connect(remote.address, "other"),
     ):
         with pytest.raises(InputError):
