@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.table import Table
 
-from normlift_ns.cli.common import CONSOLE, info, parse_flags, plain_text, run_command
+from normlift_ns.cli.common import CONSOLE, info, info_progress, parse_flags, plain_text, run_command
 from normlift_ns.cli.lift import NormLift
 from normlift_ns.cli.preflight import check_readable_file, check_writable_folder
 from normlift_ns.distributed.launch import TORCHRUN_VARIABLES, describe_signal, end_processes, exit_with_parent
@@ -550,8 +550,8 @@ class NormLiftBatch(CheckedOptions):
         check_writable_folder(folder, "--results")
         count = f"{len(all_captures)} capture{'' if len(all_captures) == 1 else 's'}"
         part = "" if shard.count == 1 else f" ({len(captures)} in part {shard.index + 1} of {shard.count})"
-        info(f"{count} in {self.captures}{part}; results, logs and claims in {folder}")
-        outcomes = lift_captures(captures, folder, self.patience, on_message=info)
+        info_progress(f"{count} in {self.captures}{part}; results, logs and claims in {folder}")
+        outcomes = lift_captures(captures, folder, self.patience, on_message=info_progress)
         if len(captures) > 0:
             CONSOLE.print(outcomes_table(captures, outcomes))
             states = [outcomes[capture.key].state for capture in captures if capture.key in outcomes]

@@ -280,7 +280,9 @@ class NormLiftQuery(CheckedOptions):
         check_sam_checkpoint(model, TEXT_PROMPT_FAMILIES)
         run, question = self._run, result.question
         count = len(run.scene.train)
-        common.info(f"Running SAM 3 on {min(self.segment_views, count)} of {count} training view{'s' * (count != 1)}")
+        common.info_progress(
+            f"Running SAM 3 on {min(self.segment_views, count)} of {count} training view{'s' * (count != 1)}"
+        )
         cached = CachedTextMasks(model, device, cache_folder(run.folder) / "masks")
         segmented = query_sam3(
             run.scene,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.table import Column, Table
 
-from normlift_ns.cli.common import CONSOLE, info, plain_text, run_command
+from normlift_ns.cli.common import CONSOLE, info, info_progress, plain_text, run_command
 from normlift_ns.cli.preflight import check_new_files
 from normlift_ns.encoders import open_clip
 from normlift_ns.encoders.huggingface import MODEL_FAMILIES, fetch_model, find_local_model
@@ -182,7 +182,7 @@ class NormLiftWeights(CheckedOptions):
         check_new_files(self.output_json, overwrite=self.overwrite, flags="--output-json")
         for name in dict.fromkeys(self.get):
             if WEIGHTS[name].find() is None:
-                info(f"Fetching {name}: {WEIGHTS[name].size} from {WEIGHTS[name].origin}")
+                info_progress(f"Fetching {name}: {WEIGHTS[name].size} from {WEIGHTS[name].origin}")
             CONSOLE.print(f"{name}: {WEIGHTS[name].fetch()}", soft_wrap=True)
         found = {name: weights.find() for name, weights in WEIGHTS.items()}
         if len(self.get) == 0:

@@ -1,4 +1,4 @@
-"""Reader and encoder for glTF files with the extension KHR_gaussian_splatting, binary (GLB) or with separate buffers.
+"""Reader for glTF files (.gltf and .glb) with the extension KHR_gaussian_splatting, and encoder for GLB files.
 
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
 """

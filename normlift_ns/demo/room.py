@@ -49,7 +49,7 @@ _STRAY_SHARE = 0.1
 _FLOATER_SHARE = 0.02
 """Fraction of Gaussians that float in the air."""
 _MARGIN = 0.05
-"""Largest distance of a part from the bounding box of its sample, in meters."""
+"""Margin in meters around the bounding box of the sampled points of a part, so that it contains the whole part."""
 _FAINT_OPACITIES = (0.001, 0.1)
 """Range of the opacities of strays and floaters. Rasterizers never draw a Gaussian with an opacity below 1 / 255."""
 

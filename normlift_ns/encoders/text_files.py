@@ -202,7 +202,9 @@ class TextEmbeddingFile(LazyTextEncoder):
         lengths = sorted({len(array) for array in arrays.values()})
         if len(lengths) > 1:
             found = ", ".join(map(str, lengths))
-            raise InputError(f"{self.file} has vectors of different lengths ({found}); encode all prompts with one encoder")
+            raise InputError(
+                f"{self.file} has vectors of different lengths ({found}); encode all prompts with one encoder"
+            )
         return {name: array.astype(np.float64) for name, array in arrays.items()}
 
 

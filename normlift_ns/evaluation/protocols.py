@@ -53,7 +53,8 @@ class Names:
 def read_names(path: Path) -> Names:
     """Read a JSON file such as {"labels": {"1": "table", ...}, "background": 0}.
 
-    The file may also consist of the inner object alone, such as {"1": "table", ...}. Values with the same name belong to the same class.
+    The file may also consist of the inner object alone, such as {"1": "table", ...}. Values with the same name belong
+    to the same class.
 
     Raises:
         FileNotFoundError: If the file does not exist.

@@ -158,8 +158,8 @@ def features(served: ServedRun, query: Any) -> Content:
     start, stop = (int(_number(name, query.get(name, str(end)))) for name, end in (("start", 0), ("stop", count)))
     if not 0 <= start < stop <= count or stop - start > schema.MAX_FEATURES:
         raise InputError(
-            f"start and stop must satisfy 0 <= start < stop <= {count:,} and differ by at most {schema.MAX_FEATURES:,}, "
-            f"got {start:,} and {stop:,}."
+            f"start and stop must satisfy 0 <= start < stop <= {count:,} and differ by at most "
+            f"{schema.MAX_FEATURES:,}, got {start:,} and {stop:,}."
         )
     return npy(
         served.space.field.directions(torch.arange(start, stop), refined=query.get("refined") != "false").float()

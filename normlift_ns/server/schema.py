@@ -254,8 +254,8 @@ def select_state(served: ServedRun, selection: Selection) -> State:
     """Return a state with the requested selection.
 
     Raises:
-        ValueError: A prompt cannot be encoded, the prompt or the object does not exist, the ray or the region selects no Gaussian, or
-            the mask has the wrong size.
+        ValueError: A prompt cannot be encoded, the prompt or the object does not exist, the ray or the region selects
+            no Gaussian, or the mask has the wrong size.
     """
     state = State(served.space, color_mode="overlay")
     if selection.question is not None:
