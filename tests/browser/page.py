@@ -118,7 +118,7 @@ class OnPage(Person):
         before = self.page.evaluate("page.revision")
         self.prompts.fill(line)
         self.prompts.press("Enter") if key else self.press("Ask")
-        self.until(lambda: self.page.evaluate("page.revision") > before, f"an answer to {line!r}")
+        self.until(lambda: self.page.evaluate("page.state.revision") > before, f"an answer to {line!r}")
 
     def chips(self) -> list[str]:
         return self.page.locator("#answers .chip").all_inner_texts()

@@ -344,7 +344,7 @@ def test_no_frame_is_missing_or_unsorted(page: OnPage) -> None:
     assert page.state("threshold") > threshold
     before = page.page.evaluate("page.revision")
     assert page.page.evaluate("(page.search.ask('yellow'), !document.querySelector('#busy').hidden)")
-    page.until(lambda: page.page.evaluate("page.revision") > before and page.page.locator("#busy").is_hidden(), "done")
+    page.until(lambda: page.state("revision") > before and page.page.locator("#busy").is_hidden(), "done")
     assert page.state("threshold") == threshold  # that of the question before is not carried over
     assert re.fullmatch(r"\d\.\d\d", page.page.locator("#threshold-value").inner_text())
 
