@@ -236,7 +236,7 @@ class RemoteRun:
         """
         stop = self.info["num_gaussians"] if stop is None else stop
         firsts = range(start, max(stop, start + 1), MAX_FEATURES)
-        paths = [self._path(f"features?start={first}&stop={min(stop, first + MAX_FEATURES)}") for first in firsts]
+        paths = (self._path(f"features?start={first}&stop={min(stop, first + MAX_FEATURES)}") for first in firsts)
         return torch.cat([torch.from_numpy(np.load(io.BytesIO(self._get(path)))) for path in paths])
 
     @check_arguments
