@@ -161,8 +161,9 @@ class NormLift(CheckedOptions):
         start_time = common.command_start()
         keep_freed_memory()
         common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        from normlift_ns.encoders.langsplat import FeatureExport  # noqa: PLC0415
-        from normlift_ns.pipeline import run_lift  # noqa: PLC0415 (as above)
+        with common.paused_collection():
+            from normlift_ns.encoders.langsplat import FeatureExport  # noqa: PLC0415
+            from normlift_ns.pipeline import run_lift  # noqa: PLC0415 (as above)
 
         import_time = time.perf_counter()
         message_times: list[float] = []
