@@ -938,7 +938,7 @@ def lift_calls(
 
     def start_libraries() -> None:
         rows = torch.eye(regions, device=device)
-        torch.linalg.eigh((rows @ rows).double())  # cuBLAS and cuSOLVER
+        torch.linalg.eigh((rows @ rows).double())  # on a GPU, these are cuBLAS and cuSOLVER
 
     def of_dimension(dimension: int) -> list[Callable[[], None]]:
         features = torch.zeros(regions, dimension, device=device)

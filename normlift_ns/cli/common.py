@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import atexit
-import gc
 import inspect
 import io
 import os
@@ -308,23 +307,6 @@ def command_start() -> float:
     Return the current time if the command is called as a function.
     """
     return _process_starts[-1] if len(_process_starts) > 0 else time.perf_counter()
-
-
-@contextmanager
-def paused_collection() -> Iterator[None]:
-    """Import modules without collecting garbage, and leave their objects out of all later collections.
-
-    Imports of torch create 200,000 objects, which stay. The collections of a lift would visit them several times, which
-    takes half a second.
-    """
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        if enabled:
-            gc.enable()
 
 
 def _process_age() -> float:

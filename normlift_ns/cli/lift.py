@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import shlex
 import sys
@@ -161,7 +162,7 @@ class NormLift(CheckedOptions):
         start_time = common.command_start()
         keep_freed_memory()
         common.info_progress(f"Opening {self.load_config or self.load_ply or self.load_gsplat}")
-        with common.paused_collection():
+        with paused_collection():
             from normlift_ns.encoders.langsplat import FeatureExport  # noqa: PLC0415
             from normlift_ns.pipeline import run_lift  # noqa: PLC0415 (as above)
 
@@ -329,6 +330,23 @@ def frequent_switches() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(interval)
+
+
+@contextmanager
+def paused_collection() -> Iterator[None]:
+    """Import modules without collecting garbage, and leave their objects out of all later collections.
+
+    Imports of torch create 200,000 objects, which stay. Visiting them in several collections would take about half a
+    second.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        if enabled:
+            gc.enable()
 
 
 def load_drivers(device: str) -> None:
